@@ -1,4 +1,4 @@
-"""What is drawn: canvas, scene, camera, shading, legend, pictures, animation."""
+"""The 3D view: canvas, scene, camera, shading, legend, pictures and videos."""
 
 import os
 
@@ -6,7 +6,7 @@ from platformdirs import user_cache_path
 
 
 def _has_cache() -> bool:
-    """Whether the user has a folder for caches, or can have one, as Mesa makes it."""
+    """Whether the user's cache folder, which Mesa needs, exists or can be made, and is writable."""
     try:
         user_cache_path().mkdir(exist_ok=True)
     except OSError:
@@ -15,5 +15,5 @@ def _has_cache() -> bool:
 
 
 if not _has_cache():
-    # Mesa would say so on standard error with every surface.
+    # Without a cache folder, Mesa warns on standard error for every surface.
     os.environ.setdefault("MESA_SHADER_CACHE_DISABLE", "true")

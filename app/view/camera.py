@@ -1,4 +1,4 @@
-"""The camera: how it moves, eases and measures depth under the pointer."""
+"""Camera geometry: framing, motion and animation of the camera, and the depth of drags."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ CAMERAS = ("Three-quarter", "Front", "Back", "Left", "Right", "Top")
 """Names of the preset views; left and right are the body's own."""
 
 VIEW_ANGLE = 24.0
-"""Degrees from the picture's bottom to its top: narrow, so that near limbs do not swell."""
+"""Vertical field of view in degrees; narrow, so that near limbs do not look swollen."""
 
 _MARGIN = 1.2
 _ALONG_SIGHT = 0.3
-"""Sine of the angle to the line of sight below which an axis counts as seen from its end."""
+"""Sine of the angle to the line of sight below which an axis counts as seen end-on."""
 _STEEPEST = 89.0
-"""Degrees above or below the horizon to which the camera is turned by hand."""
+"""Limit, in degrees above or below the horizon, for turning the camera by hand."""
 _NEAREST, _FARTHEST = 0.05, 15.0
 """Limits of zooming, in body sizes."""
 
@@ -46,19 +46,19 @@ class View:
 def preset_view(
     name: str, vertices: npt.NDArray[Any], up_axis: int, front: FloatArray, aspect: float
 ) -> View:
-    """Look at a whole mesh from a side.
+    """Return a view of a whole mesh from a preset side.
 
     Parameters
     ----------
     name : one of `CAMERAS`
     vertices : (V, 3) array
     up_axis : 0, 1 or 2
-    front : (3,) array of length 1, the direction that the body faces
-    aspect : the picture's width over its height
+    front : (3,) unit vector, the direction that the body faces
+    aspect : width over height of the image
 
     Raises
     ------
-    KeyError : `name` is no preset.
+    KeyError : `name` is not a preset.
     """
     up = np.eye(3)[up_axis]
     left = np.cross(up, front)
@@ -68,21 +68,21 @@ def preset_view(
         "Back": -front,
         "Left": left,
         "Right": -left,
-        # Straight from above, an upright camera has no defined direction to turn in.
+        # Tilt slightly: straight from above, the direction of an upright camera is undefined.
         "Top": up + 0.02 * front,
     }[name]
     return framing(vertices, towards, up, aspect)
 
 
 def framing(vertices: npt.NDArray[Any], towards: FloatArray, up: FloatArray, aspect: float) -> View:
-    """Look at a whole mesh from a direction.
+    """Return a view of a whole mesh from a direction.
 
     Parameters
     ----------
     vertices : (V, 3) array
     towards : (3,) array, from the mesh to the camera
-    up : (3,) array of length 1, upright in the picture
-    aspect : the picture's width over its height
+    up : (3,) unit vector, upright in the image
+    aspect : width over height of the image
     """
     towards = towards / np.linalg.norm(towards)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -93,12 +93,12 @@ def framing(vertices: npt.NDArray[Any], towards: FloatArray, up: FloatArray, asp
 
 
 def sees_all(view: View, vertices: npt.NDArray[Any], aspect: float) -> bool:
-    """Tell whether a whole mesh is inside the picture.
+    """Return whether a whole mesh is inside the image.
 
     Parameters
     ----------
     vertices : (V, 3) array
-    aspect : the picture's width over its height
+    aspect : width over height of the image
     """
     arm = view.position - view.focus
     distance = float(np.linalg.norm(arm))
@@ -109,16 +109,16 @@ def sees_all(view: View, vertices: npt.NDArray[Any], aspect: float) -> bool:
 def kept_in_view(
     view: View, before: npt.NDArray[Any], after: npt.NDArray[Any], aspect: float
 ) -> View | None:
-    """Keep the whole mesh in view from the same side, if it was before the pose changed.
+    """Frame the whole mesh from the same side if a change of pose moved it out of view.
 
     Parameters
     ----------
     before, after : (V, 3) arrays
-    aspect : the picture's width over its height
+    aspect : width over height of the image
 
     Returns
     -------
-    wanted : None if the view may stay as it is
+    wanted : the new view; None if the view may stay, or did not show the whole mesh before
     """
     if not sees_all(view, before, aspect) or sees_all(view, after, aspect):
         return None
@@ -128,16 +128,16 @@ def kept_in_view(
 def followed(
     view: View, before: npt.NDArray[Any], after: npt.NDArray[Any], up_axis: int, aspect: float
 ) -> View:
-    """Move a camera along with a body that moves on, so that it stays where it is in the picture.
+    """Move a camera along with a moving body, which keeps its position in the image.
 
-    The camera stays level, so that steps and jumps are seen, unless the body would leave the
-    picture.
+    The camera stays level, so that steps and jumps are visible, unless the body would leave the
+    image.
 
     Parameters
     ----------
     before, after : (V, 3) arrays
     up_axis : 0, 1 or 2
-    aspect : the picture's width over its height
+    aspect : width over height of the image
     """
     way = after.mean(axis=0, dtype=np.float64) - before.mean(axis=0, dtype=np.float64)
     level = np.where(np.arange(3) == up_axis, 0.0, way)
@@ -150,7 +150,7 @@ def followed(
 def _needed_distances(
     offset: npt.NDArray[Any], towards: FloatArray, up: FloatArray, aspect: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how far before the camera each point must lie to be seen, and its own depth."""
+    """Return the least distance at which each point is in view, and its offset to the camera."""
     upward = up - (up @ towards) * towards
     upward /= np.linalg.norm(upward)
     half_height = np.tan(np.radians(0.5 * VIEW_ANGLE))
@@ -164,20 +164,19 @@ def _needed_distances(
 def zoomed(
     view: View, anchor: FloatArray, factor: float, vertices: npt.NDArray[Any], body_size: float
 ) -> View:
-    """Bring the camera nearer to a point, or away from it; the point stays in its place on screen.
+    """Move the camera towards a point, or away from it; the point stays in place on the screen.
 
     Parameters
     ----------
     anchor : (3,) array, in the data's unit
-    factor : of the distance to it, below 1 to come nearer; limited at both ends
-    vertices : (V, 3) array; turning goes round a point of the line of sight that is as deep in the
-        scene as they are
+    factor : of the distance to the point, below 1 to come nearer; limited at both ends
+    vertices : (V, 3) array; the focus, about which the camera turns, stays within their depths
     body_size : in the data's unit
     """
     arm = view.position - anchor
     distance = float(np.linalg.norm(arm))
     near, far = _NEAREST * body_size, _FARTHEST * body_size
-    # Never past a limit, but one that is beyond it already may stay.
+    # Do not pass a limit, but let a camera that is already beyond it stay.
     factor = float(np.clip(factor, min(near / distance, 1.0), max(far / distance, 1.0)))
     position = anchor + factor * arm
     sight = view.focus - view.position
@@ -189,7 +188,7 @@ def zoomed(
 
 
 def turned(view: View, across: float, upwards: float) -> View:
-    """Turn a camera round its focus; it stays upright.
+    """Turn an upright camera round its focus.
 
     Parameters
     ----------
@@ -209,46 +208,46 @@ def turned(view: View, across: float, upwards: float) -> View:
 
 
 def shifted(view: View, start: Pixel, end: Pixel, size: Pixel) -> View:
-    """Shift a camera so that what is as deep as its focus follows the pointer.
+    """Shift a camera so that points at the depth of its focus follow the pointer.
 
     Parameters
     ----------
-    start, end : of the pointer; see `seen_at`
-    size : of the picture
+    start, end : positions of the pointer; see `seen_at`
+    size : of the image
     """
     motion = seen_at(view, start, size, view.focus) - seen_at(view, end, size, view.focus)
     return View(view.position + motion, view.focus + motion, view.up)
 
 
 def turn_about(axis: FloatArray, view: View) -> FloatArray:
-    """Return the direction on the picture in which what is before an axis moves as it turns.
+    """Return the image direction in which points before an axis move as they turn about it.
 
     Parameters
     ----------
-    axis : (3,) array of length 1; what it turns, turns anticlockwise seen from its tip
+    axis : (3,) unit vector; the turn is anticlockwise seen from its tip
 
     Returns
     -------
-    direction : (2,) array of length 1, to the right and down
+    direction : (2,) unit vector, to the right and down
     """
     right, upward, forward = _axes(view)
     motion = np.cross(axis, -forward)
     across = np.array([motion @ right, -(motion @ upward)])
     length = float(np.linalg.norm(across))
     if length < _ALONG_SIGHT:
-        # Seen from its end, where the upper rim goes left as it turns towards the viewer.
+        # The axis is seen end-on: use the horizontal, in which the upper rim moves.
         return np.array([np.sign(axis @ forward) or 1.0, 0.0])
     direction: FloatArray = across / length
     return direction
 
 
 def seen_at(view: View, place: Pixel, size: Pixel, deep_as: FloatArray) -> FloatArray:
-    """Return the (3,) point that is seen at a place of the picture, as deep as another point.
+    """Return the (3,) point at an image position, at the depth of another point.
 
     Parameters
     ----------
-    place : in pixels from the picture's left and top
-    size : width and height of the picture, in the same pixels
+    place : in pixels from the left and top of the image
+    size : width and height of the image, in the same pixels
     deep_as : (3,) array, in the data's unit
     """
     axes = _axes(view)
@@ -260,15 +259,15 @@ def seen_at(view: View, place: Pixel, size: Pixel, deep_as: FloatArray) -> Float
 
 
 def places_of(view: View, points: npt.NDArray[Any], size: Pixel) -> FloatArray:
-    """Return where points are seen: (N, 2), in pixels from the picture's left and top.
+    """Project points to (N, 2) image positions, in pixels from the left and top.
 
     Parameters
     ----------
     points : (N, 3) array, in the data's unit, before the camera
-    size : width and height of the picture
+    size : width and height of the image
     """
     if not len(points):
-        # Most pictures have no marks, and there is one after each event.
+        # A fast path: most pictures have no marks, and each event draws one.
         return np.empty((0, 2))
     right, upward, depth = _axes(view) @ (points - view.position).T
     pixel = _pixel(np.maximum(depth, 1e-9), size[1])
@@ -276,13 +275,13 @@ def places_of(view: View, points: npt.NDArray[Any], size: Pixel) -> FloatArray:
 
 
 def pixel_length(view: View, point: FloatArray, size: Pixel) -> float:
-    """Return how long one pixel of a picture is at a (3,) point, in the data's unit."""
+    """Return the size of a pixel at the depth of a (3,) point, in the data's unit."""
     depth = float((point - view.position) @ _axes(view)[2])
     return float(_pixel(max(depth, 1e-9), size[1]))
 
 
 def _axes(view: View) -> FloatArray:
-    """Return the camera's right, up and forward, each of length 1, as the rows of a matrix."""
+    """Return the camera's right, up and forward unit vectors as the rows of a matrix."""
     forward = view.focus - view.position
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, view.up)
@@ -291,12 +290,12 @@ def _axes(view: View) -> FloatArray:
 
 
 def _pixel(depth: Any, height: float) -> Any:
-    """Return how long one pixel of a picture is at a depth, in the data's unit."""
+    """Return the size of a pixel at a depth, in the data's unit."""
     return 2.0 * depth * np.tan(np.radians(0.5 * VIEW_ANGLE)) / height
 
 
 def between(start: View, end: View, fraction: float) -> View:
-    """Blend two cameras, on an arc round their focus.
+    """Interpolate two cameras on an arc round their focus.
 
     Parameters
     ----------
@@ -312,7 +311,7 @@ def between(start: View, end: View, fraction: float) -> View:
     axis = np.cross(a, b)
     angle = np.arctan2(np.linalg.norm(axis), a @ b)
     if np.linalg.norm(axis) < 1e-3:
-        # From front to back the axis is ambiguous: take the upright one.
+        # From front to back, or without a turn, the axis is undefined: use the up direction.
         axis = end.up
     turn = Rotation.from_rotvec(fraction * angle * axis / np.linalg.norm(axis))
     length = (1.0 - fraction) * lengths[0] + fraction * lengths[1]
@@ -321,32 +320,32 @@ def between(start: View, end: View, fraction: float) -> View:
 
 
 _MOST_THICK = 0.12
-"""Of the body size: no limb that is held is thicker."""
+"""Largest thickness of a dragged limb, as a fraction of the body size."""
 
 _CLEAR = 0.01
-"""Of the body size: from the surface to what is dragged over it, which would catch on it."""
+"""Gap between a surface and a patch dragged over it, as a fraction of the body size."""
 
 _WIDE = 0.06
-"""Of the body size: half as wide is a hand, which goes round what it would run into."""
+"""Half the width of the rolling ellipsoid, about that of a hand, as a fraction of the body size."""
 
 _LEAST_SEEN = 0.05
-"""The least squared sine of the angle between an axis and the line of sight."""
+"""Lower bound of the squared sine of the angle between an axis and the line of sight."""
 
 
 class DragDepth:
-    """Finds the point that is meant by a place of the picture.
+    """Find the 3D target of a drag from an image position.
 
-    It lies as deep as what was taken hold of, but before the rest of the body where that is nearer,
-    as if half an ellipsoid rolled over it: a hand goes round a hip and comes to rest on it instead
-    of behind it. Once `shift` is called, it lies only so deep as is wanted.
+    The target is at the depth of the grabbed point, but in front of the rest of the body where
+    that is nearer, as if half an ellipsoid rolled over it: a hand goes round a hip and comes to
+    rest on it, not behind it. Once `shift` is called, only the chosen depth counts.
 
     Parameters
     ----------
-    view, size : of the picture, which stay the same
-    taken : (3,) point that was taken hold of
-    vertices : (V, 3) as the drag begins
-    faces : (F, 3) of the mesh
-    moving : (V,) bool array, what follows the pointer, and is never in the way of itself
+    view, size : camera and size of the image, fixed during the drag
+    taken : (3,) point that was grabbed
+    vertices : (V, 3) array, as the drag begins
+    faces : (F, 3) array, of the mesh
+    moving : (V,) bool array, the vertices that follow the pointer and cannot obstruct it
     body_size : in the data's unit
     """
 
@@ -367,19 +366,19 @@ class DragDepth:
         self._corners = vertices[faces[~moves.any(axis=1)]].astype(np.float64)
         places = places_of(view, self._corners.reshape(-1, 3), size).reshape(-1, 3, 2)
         self._low, self._high = places.min(axis=1), places.max(axis=1)
-        # Middles of faces too, where a mesh is coarse.
+        # Add the centroids of faces, for coarse meshes.
         middles = self._corners.mean(axis=1)
         used = np.unique(faces[~moves.any(axis=1)])
         self._points = np.concatenate([vertices[used].astype(np.float64), middles])
         away = taken - view.position
         distances = _distances(view.position, away, vertices[faces[moves.all(axis=1)]])
-        # The far side of what is held rests on the surface.
+        # The far side of the grabbed limb rests on the surface: find its thickness.
         behind = distances[distances > 1.0] * np.linalg.norm(away)
         thick = float(behind.min(initial=np.inf) - np.linalg.norm(away))
         self._thickness = (thick if thick < _MOST_THICK * body_size else 0.0) + _CLEAR * body_size
 
     def point(self, place: Pixel) -> FloatArray:
-        """Return the (3,) point that is meant by a place of the picture."""
+        """Return the (3,) target for an image position."""
         view = self._view
         there = seen_at(view, place, self._size, self._plane)
         if not self._snaps:
@@ -400,14 +399,14 @@ class DragDepth:
         return point
 
     def shift(self, place: Pixel, by: float) -> None:
-        """Move what is meant by a place away from the viewer, and stay so deep from now on."""
+        """Move the target at an image position away from the viewer, and keep that depth."""
         forward = self._view.focus - self._view.position
         self._plane = self.point(place) + by * forward / np.linalg.norm(forward)
         self._snaps = False
 
 
 def _distances(start: FloatArray, way: FloatArray, corners: npt.NDArray[np.floating]) -> FloatArray:
-    """Return where a ray crosses triangles, as shares > 0 of its (3,) way.
+    """Return where a ray hits triangles, as positive multiples of its (3,) direction.
 
     Parameters
     ----------
@@ -435,12 +434,12 @@ def _distances(start: FloatArray, way: FloatArray, corners: npt.NDArray[np.float
 def along_axis(
     view: View, place: Pixel, size: Pixel, origin: FloatArray, axis: FloatArray
 ) -> float:
-    """Return how far along an axis the point lies that is nearest to the ray through a place.
+    """Return the coordinate, along an axis, of the point nearest to the ray of an image position.
 
     Parameters
     ----------
-    origin, axis : (3,) point and unit vector; an axis that points to the viewer is taken to be
-        seen a little from the side
+    origin, axis : (3,) point and unit vector; an axis along the line of sight is treated as if it
+        were seen slightly from the side
     """
     ray = seen_at(view, place, size, origin) - view.position
     ray /= np.linalg.norm(ray)
@@ -449,16 +448,16 @@ def along_axis(
 
 
 class Animation(QVariantAnimation):
-    """Animates once from one state to another, eased at both ends.
+    """Animate once from one state to another, with easing at both ends.
 
     Parameters
     ----------
-    milliseconds : how long it takes
+    milliseconds : duration
     parent : of the object
 
     Signals
     -------
-    moved : what the function that was given to `begin` returns
+    moved : the state that the function passed to `begin` returns
     """
 
     moved = Signal(object)
@@ -470,11 +469,11 @@ class Animation(QVariantAnimation):
 
     @property
     def is_running(self) -> bool:
-        """Whether it is running."""
+        """Whether the animation is running."""
         return self.state() is not QAbstractAnimation.State.Stopped
 
     def begin(self, at: Callable[[float], object]) -> None:
-        """Start again; `at` returns the state at a fraction from 0 to 1."""
+        """Restart; `at` returns the state at a fraction from 0 to 1."""
         self.stop()
         self._at = at
         self.start()

@@ -1,4 +1,4 @@
-"""The canvas on which VTK draws, and what the mouse does there."""
+"""The canvas on which VTK draws, and its mouse interaction."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ _HOVER_MILLISECONDS = 30
 _SMOOTH_SAMPLES = 4
 _NOTCH = 120.0  # of a wheel, in eighths of a degree
 _CLICK = 4
-"""Pixels that the pointer may move in a click."""
+"""Distance, in pixels, from which a press and move is a drag, not a click."""
 
 _KEYS_OF_DRAGS = {Qt.Key.Key_Escape: 0.0, Qt.Key.Key_PageUp: 1.0, Qt.Key.Key_PageDown: -1.0}
-"""Keys that a drag takes before the window, and the notches of the wheel that they stand for."""
+"""Keys that a drag takes before the window, with the wheel notches that they stand for."""
 
 _FOR_THE_WINDOW = (
     QEvent.Type.KeyPress,
@@ -61,19 +61,21 @@ _FOR_THE_WINDOW = (
     QEvent.Type.DragEnter,
     QEvent.Type.Drop,
 )
-"""VTK binds keys itself, and pyvistaqt would add any dropped file as a mesh."""
+"""Events left to the window: VTK binds keys itself, and pyvistaqt adds any dropped file as a
+mesh."""
 
 _SLOW_SECONDS, _FAST_SECONDS = 0.020, 0.012
-"""A smooth picture that takes longer makes a drag stutter; one that takes less leaves time for
-other work before the next one."""
+"""Limits of the render time: a smooth picture above the first makes a drag stutter; one below the
+second leaves time for other work."""
 _SLOW_PICTURES = 3
 
 
 class Smoothness:
-    """Whether pictures are drawn with smooth edges while something moves, by how long they take.
+    """Decide from render times whether to anti-alias pictures while something moves.
 
-    They are until some in a row are slow, as where no graphics card helps; then rough ones are,
-    until a smooth one, as at rest, is fast. Between the two limits nothing changes.
+    Anti-alias until several pictures in a row are slow, as without a graphics card. From then on
+    draw rough pictures while moving, until a smooth one, drawn at rest, is fast. A time between
+    the two limits does not switch.
     """
 
     def __init__(self) -> None:
@@ -81,11 +83,11 @@ class Smoothness:
 
     @property
     def while_moving(self) -> bool:
-        """Whether the next picture of a motion is to be smooth."""
+        """Whether to anti-alias the next picture while something moves."""
         return self._n_slow < _SLOW_PICTURES
 
     def note(self, seconds: float) -> None:
-        """Record how long a smooth picture took."""
+        """Record the render time of a smooth picture."""
         if seconds < _FAST_SECONDS:
             self._n_slow = 0
         elif seconds > _SLOW_SECONDS:
@@ -95,35 +97,35 @@ class Smoothness:
 
 
 class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
-    """Draws on request and whenever Qt paints, once for each event.
+    """A VTK widget that draws on request and on Qt's paint events, once per event.
 
     Parameters
     ----------
-    before_paint : is called before each picture, to bring the scene up to date; must leave widgets
-        alone: showing or resizing one lays out the window, which may resize this canvas, and Qt
-        then frees the framebuffer and the texture that are being drawn into
+    before_paint : called before each picture, to update the scene. It must not touch widgets:
+        showing or resizing one lays out the window and may resize this canvas, and Qt then frees
+        the framebuffer and the texture that are being drawn into
     parent : of the widget
 
     Attributes
     ----------
-    n_painted : how many pictures have been drawn
-    is_smooth : whether the next one has smooth edges
-    is_settled : whether the smooth picture of the scene is drawn, and no other is asked for
+    n_painted : number of pictures drawn
+    is_smooth : whether the next picture is anti-aliased
+    is_settled : whether the current scene is drawn smooth and no other picture is requested
     is_dragging : whether a button is pressed and the pointer has moved since
 
     Signals
     -------
-    painted : float, the seconds that drawing one picture took; what it calls must leave widgets
-        alone too, or be connected queued
+    painted : float, the seconds that one picture took; its slots must not touch widgets either,
+        unless connected queued
     hovered : QPointF in the widget, or None as the pointer leaves; while no button is pressed
     drag_began : QPointF where a button was pressed, Qt.MouseButton, and the Qt.KeyboardModifiers;
         once the pointer has moved too far for a click
-    dragged : QPointF, where the pointer is now
+    dragged : QPointF, the pointer's position
     drag_ended : bool, whether by Escape
     double_clicked : QPointF
     wheel_turned : QPointF, float, in notches, and Qt.KeyboardModifiers; also by keys in a drag
-    pinched : QPointF and float, the factor by which two fingers were spread
-    menu_wanted : QPointF in the widget, where it was clicked with the right button
+    pinched : QPointF and float, the scale factor of the gesture
+    menu_wanted : QPointF in the widget, the position of the right click
     """
 
     painted = Signal(float)
@@ -139,7 +141,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
     is_dragging = False
 
     def __init__(self, before_paint: Callable[[], None], parent: QWidget | None = None) -> None:
-        # The default for auto_update draws five times a second for ever.
+        # By default, auto_update draws five times a second forever.
         super().__init__(parent, auto_update=False, multi_samples=0)
         self.setAcceptDrops(False)
         self.setAccessibleName("View of the body")
@@ -157,7 +159,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self._picker = vtkCellPicker()
         self._picker.PickFromListOn()
         self._picker.SetTolerance(0.0)
-        # VTK would draw at once for each change, and Qt then again.
+        # Otherwise VTK draws at once for each change, and Qt draws again.
         self._vtk_interactor = self.ren_win.GetInteractor()
         self._vtk_interactor.EnableRenderOff()
         self._observer = self._vtk_interactor.AddObserver("RenderEvent", self._on_render_wanted)
@@ -172,19 +174,19 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self.update()
 
     def look_again(self) -> None:
-        """Signal soon what is under the pointer."""
+        """Signal the pointer's position again, after a short delay."""
         if not self._shut:
             self._hover.start()
 
     def pick(
         self, position: QPointF, actor: vtkActor
     ) -> tuple[int, npt.NDArray[np.float64]] | None:
-        """Return the vertex that is seen at a position and the point of the surface, (3,).
+        """Return the vertex picked at a position and the (3,) point of the surface, or None.
 
         Parameters
         ----------
         position : in the widget, in device-independent pixels
-        actor : the mesh, which may be hidden by another look of it
+        actor : of the mesh; it may be hidden while the mesh is drawn textured
         """
         ratio = self.devicePixelRatioF()
         self._picker.InitializePickList()
@@ -199,7 +201,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         return int(self._picker.GetPointId()), np.array(self._picker.GetPickPosition())
 
     def shut_down(self) -> None:
-        """Stop the timers and free what is on the graphics card; nothing is drawn afterwards."""
+        """Stop the timers and free the graphics memory; nothing is drawn afterwards."""
         if self._shut:
             return
         self._shut = True
@@ -212,16 +214,17 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self.close()
 
     def initializeGL(self) -> None:  # noqa: N802 - Qt's name
-        """Let PySide forget the surface of the context when Qt deletes both.
+        """Invalidate PySide's wrapper of the context's surface before Qt deletes both.
 
-        It counts as a part of the widget, and would pass for what takes its place in memory.
+        PySide keeps the wrapper with the widget, and would return it for any object that Qt later
+        allocates at the same address.
         """
         super().initializeGL()
         context = self.context()
         context.aboutToBeDestroyed.connect(partial(shiboken6.invalidate, context.surface()))
 
     def paintGL(self) -> None:  # noqa: N802 - Qt's name
-        """Bring the scene up to date and draw it."""
+        """Update the scene and draw it."""
         if self._shut:
             return
         self._before_paint()
@@ -234,7 +237,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
             self._vtk_interactor.EnableRenderOff()
             self._painting = False
         if self.is_smooth:
-            # A graphics card is asked to draw and returns before it has.
+            # Wait, to measure the time: a graphics card draws asynchronously.
             self.ren_win.WaitForCompletion()
         seconds = time.perf_counter() - start
         self.is_settled = self.is_smooth
@@ -244,21 +247,21 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self.painted.emit(seconds)
 
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
-        """Draw rough pictures while the window is resized."""
+        """Redraw at the new size."""
         super().resizeEvent(event)
         self.redraw()
 
     def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
-        """Begin a click or a drag; a second button changes nothing."""
+        """Begin a click or a drag; ignore a second button."""
         if self._press is None:
             self._hover.stop()
             self._press = (event.position(), event.button(), event.modifiers())
 
     def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
-        """Drag while a button is pressed, signal the pointer otherwise."""
+        """Drag while a button is pressed; otherwise signal the pointer."""
         self._pointer = event.position()
         if self._press is not None and not event.buttons() & self._press[1]:
-            # It was let go over another window.
+            # The button was released over another window.
             self._let_go()
         if self._press is None:
             if event.buttons() == Qt.MouseButton.NoButton and not self._hover.isActive():
@@ -273,7 +276,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self.dragged.emit(event.position())
 
     def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name
-        """End a drag, or ask for the menu where the right button was only clicked."""
+        """End a drag, or request the menu if the right button was only clicked."""
         if self._press is None or event.button() is not self._press[1]:
             return
         clicked = None if self.is_dragging else self._press[0]
@@ -293,22 +296,22 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
             self._hover.start()
 
     def contextMenuEvent(self, event: QContextMenuEvent) -> None:  # noqa: N802 - Qt's name
-        """Ask for the menu by its key; the right button may yet drag."""
+        """Request the menu for the menu key only; the right button may still start a drag."""
         event.accept()
         if event.reason() is QContextMenuEvent.Reason.Keyboard:
             self.menu_wanted.emit(self._pointer or QPointF(self.rect().center()))
 
     def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802 - Qt's name
-        """Signal how far the wheel or two fingers have turned; not before a drag has begun."""
+        """Signal a wheel or two-finger scroll, but not between a press and its drag."""
         event.accept()
         notches = event.angleDelta().y() / _NOTCH
         if notches and (self._press is None or self.is_dragging):
             self.wheel_turned.emit(event.position(), notches, event.modifiers())
 
     def event(self, event: QEvent) -> bool:
-        """Signal fingers that are spread, and keys in a drag; leave the rest to the window."""
+        """Signal pinch gestures, and keys in a drag; leave other keys and drops to the window."""
         if self.is_dragging and isinstance(event, QKeyEvent) and event.key() in _KEYS_OF_DRAGS:
-            # Before the window's shortcut.
+            # Take the key before the window's shortcut does.
             event.accept()
             if event.type() is QEvent.Type.KeyPress:
                 notches = _KEYS_OF_DRAGS[Qt.Key(event.key())]
@@ -347,7 +350,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
             self._draw_smooth(True)
             self.update()
         if self.underMouse() and self._pointer is not None and self._press is None:
-            # Something else may lie beneath the pointer now.
+            # Something else may be under the pointer now.
             self._hover.start()
 
     @Slot()
@@ -364,39 +367,39 @@ FloatArray = npt.NDArray[np.float64]
 
 _ZOOM_PER_NOTCH, _ZOOM_PER_PIXEL = 1.15, 1.006
 _ZOOM_SECONDS = 0.5
-"""Seconds within which the wheel zooms towards the same point while the pointer stays."""
+"""Time, in seconds, for which the wheel zooms towards the same point while the pointer stays."""
 
 _DEGREES_PER_PIXEL = 0.4
 _TWIST_PER_PIXEL = np.pi / 300.0
 _DEPTH_PER_NOTCH = 0.015
-"""Normalised length by which a notch of the wheel brings nearer what is dragged."""
+"""Depth by which a wheel notch moves the dragged patch, in normalised length."""
 
 _HINTS = (
     "Wheel or page keys: nearer or farther",
     "P: pin it here",
     "Escape: put it back",
 )
-"""What can be done while the body is dragged."""
+"""Hints shown while the body is dragged."""
 
 _CALL_HELP = "begin with Ctrl+Shift: the whole body helps"
 
 _Drag = Callable[[QPointF], None]
 
 _SMALL, _SMALL_ROOT, _FAR_AWAY = 300.0, 4500.0, 30_000.0
-"""Pixels that all faces of a part would cover on the screen, below which it has a handle; the hips,
-which move the body, are to be found at once. Of a whole body that covers less, none has one."""
+"""Screen areas, in square pixels, of all faces: a body part below the first has a handle. The root
+part, which moves the body, has the higher second limit. A whole body below the third has none."""
 
 
 @dataclass(eq=False)
 class Handle:
-    """A part of the body that a dot may stand for.
+    """A dot to drag a body part that is small on the screen.
 
     Attributes
     ----------
     domain : index from 0
-    grip : all of its vertices alike
+    grip : all vertices of the part, with equal weights
     area : of its faces, normalised
-    most_pixels : that it may cover to be shown
+    most_pixels : screen area up to which the handle is shown, in square pixels
     is_shown : whether it was in the last picture
     """
 
@@ -408,7 +411,7 @@ class Handle:
 
 
 def handles_of(space: PoseSpace) -> list[Handle]:
-    """Return the handles of a rig's parts; a learned model's parts are large."""
+    """Return the handles of a rig's body parts; a learned model has none, as its are large."""
     from lcollision_core.posing import Grip
 
     limbs, rest, faces = space.limbs, space.rest_vertices, space.topology.faces
@@ -433,19 +436,19 @@ def handles_of(space: PoseSpace) -> list[Handle]:
 
 
 class Mouse(QObject):
-    """Turns motions of the mouse over one canvas into drags of the body and of the camera.
+    """Turn mouse events of a canvas into drags of the body and of the camera.
 
-    Left on the body drags the patch under the pointer in the plane of the picture or along the
-    surface that is in the way; meanwhile the wheel brings it nearer. With Ctrl it twists the body
-    part, with Ctrl and Shift the whole body helps; an arrow is dragged along its axis. Left beside
-    the body, middle or Alt turn the camera, with Shift they shift it. Right, up and down, zooms, as
-    the wheel does.
+    The left button on the body drags the patch under the pointer in the image plane, or along the
+    surface of what is in front; the wheel then changes its depth. Ctrl twists the body part, and
+    Ctrl+Shift lets the whole body help. An arrow is dragged along its axis. The left button beside
+    the body, the middle button or Alt turns the camera; Shift shifts it. The right button, moved
+    up or down, zooms like the wheel.
 
     Parameters
     ----------
     document : whose pose is dragged
-    canvas : has the mouse
-    scene : returns what is on the canvas, None before there is anything
+    canvas : source of the mouse events
+    scene : returns the scene on the canvas, None before there is one
 
     Attributes
     ----------
@@ -453,15 +456,15 @@ class Mouse(QObject):
     pin : index of the pin under the pointer, or None
     handle : the body part whose handle is under the pointer, or None
     arrows : vertex whose patch has arrows to drag, or None
-    helped : whether all of the body helps in the drag that goes on
+    helped : whether the whole body helps in the current drag
 
     Signals
     -------
-    pointed : QPointF in the canvas where `vertex` or `pin` is new, None beside the body
-    helped_at : QPointF in the canvas, where a drag is in which the whole body helps
-    hinted : str, what else can be done in the drag that goes on; "" as it ends
-    camera_moved : View, that the user wants
-    redraw_wanted : patch or lines have changed
+    pointed : QPointF in the canvas, the pointer, or None; `vertex` or `pin` may have changed
+    helped_at : QPointF in the canvas, the pointer in a drag in which the whole body helps
+    hinted : str, hint for the current drag; "" as it ends
+    camera_moved : View, the requested camera
+    redraw_wanted : the patch or the lines have changed
     """
 
     pointed = Signal(object)
@@ -502,7 +505,7 @@ class Mouse(QObject):
         document.history.pins_changed.connect(self.redraw_wanted)
 
     def let_go(self) -> None:
-        """Forget what is under the pointer and what is dragged, as of another model."""
+        """Forget the pointed vertex and the drag, as for another model."""
         self._forget_drag()
         self.arrows = None
         self._handles = handles_of(self._document.model.space)
@@ -514,7 +517,7 @@ class Mouse(QObject):
         self.helped = False
 
     def point_at(self, place: QPointF | None) -> None:
-        """Find what is under the pointer, and show the patch that a drag would take."""
+        """Find the pin, handle or vertex under the pointer, and show the patch of a drag."""
         self.vertex = self.pin = self.handle = None
         scene = self._scene()
         if scene is not None and place is not None:
@@ -540,7 +543,7 @@ class Mouse(QObject):
         self.pointed.emit(place)
 
     def keep_patch(self) -> None:
-        """Point at the patch that was pointed at last, until `look_again`."""
+        """Keep pointing at the last patch until `look_again`."""
         self._keeps = True
         if self.vertex is None and self._last_vertex is not None:
             self.vertex = self._last_vertex
@@ -548,17 +551,17 @@ class Mouse(QObject):
             self.pointed.emit(None)
 
     def look_again(self) -> None:
-        """Point soon at what is under the pointer."""
+        """Update what is under the pointer, after a short delay."""
         self._keeps = False
         self._canvas.look_again()
 
     def toggle_pin(self, oriented: bool = False) -> None:
-        """Pin the patch under the pointer, maybe with its orientation, or take its pin away."""
+        """Pin the patch under the pointer, optionally with its orientation, or unpin it."""
         if self.vertex is not None:
             self._document.pins.toggle(self.vertex, oriented)
 
     def toggle_arrows(self) -> None:
-        """Draw arrows on the patch under the pointer; on the arrows' own patch, take them away."""
+        """Show arrows on the patch under the pointer; hide them if they are on that patch."""
         if self.arrows is not None and self.vertex is not None:
             patch = self._document.motion.grip_at(self.vertex).vertices
             self.arrows = None if self.arrows in patch else self.vertex
@@ -567,12 +570,12 @@ class Mouse(QObject):
         self.redraw_wanted.emit()
 
     def mark(self, scene: Scene, vertices: npt.NDArray[np.float32]) -> None:
-        """Bring the marks on the body up to date, just before a picture.
+        """Update the marks on the body, just before a picture.
 
         Parameters
         ----------
         scene : that is drawn
-        vertices : (V, 3) array, of the pose that is drawn
+        vertices : (V, 3) array, of the pose drawn
         """
         self._mark_pins(scene)
         self._mark_handles(scene, vertices)
@@ -608,7 +611,7 @@ class Mouse(QObject):
         )
 
     def _mark_handles(self, scene: Scene, vertices: npt.NDArray[np.float32]) -> None:
-        """Mark the parts that are too small on the screen to be taken hold of otherwise."""
+        """Show the handles of the body parts that are too small on the screen to grab."""
         model, view = self._document.model, scene.view
         places: list[FloatArray] = []
         whole = sum(handle.area for handle in self._handles)
@@ -632,14 +635,14 @@ class Mouse(QObject):
 
     @Slot()
     def _show_patch(self) -> None:
-        """Paint the patch under the pointer, or the one that is dragged."""
+        """Paint the patch under the pointer, or the dragged one."""
         scene = self._scene()
         if scene is None:
             return
         grip = self._grip
         if grip is None and self.vertex is not None and not self._canvas.is_dragging:
             grip = self._document.motion.grip_at(self.vertex)
-        # A handle moves its part as a whole.
+        # A handle moves its whole body part, so it has no patch.
         if scene.show_grip(grip if self.handle is None else None):
             self.redraw_wanted.emit()
 
@@ -692,7 +695,7 @@ class Mouse(QObject):
                 self._drag = self._moving(scene, start, self.vertex, helped)
         else:
             self._drag = self._turning(start)
-        # A patch that is not dragged would be in the way of what is looked at.
+        # Hide a patch that is not dragged: it would cover what the user looks at.
         self._show_patch()
         self.pointed.emit(None)
 
@@ -715,7 +718,7 @@ class Mouse(QObject):
         self.redraw_wanted.emit()
 
     def _moving(self, scene: Scene, start: QPointF, vertex: int, whole_body: bool) -> _Drag:
-        """Move a patch, or the pin under the pointer, in a plane or over the body."""
+        """Drag a patch, or the pin under the pointer, in a plane or over the body."""
         document, vertices = self._document, np.asarray(scene.surface.vertices)
         grip = document.motion.grip_at(vertex)
         if self.handle is not None:
@@ -755,7 +758,7 @@ class Mouse(QObject):
         return move
 
     def _moving_along(self, scene: Scene, start: QPointF, vertex: int, axis: FloatArray) -> _Drag:
-        """Move the patch of a vertex, with its pin if it has one, along an axis."""
+        """Drag the patch of a vertex, with its pin if it has one, along an axis."""
         document, view = self._document, scene.view
         grip = self._grip = document.motion.grip_at(vertex)
         home = grip.position(np.asarray(scene.surface.vertices))
@@ -776,7 +779,7 @@ class Mouse(QObject):
         return move
 
     def _aim(self, target: Callable[[], FloatArray]) -> None:
-        """Drag on, unless another action has ended the drag while the button is pressed."""
+        """Continue the drag, unless another action ended it while the button is pressed."""
         if not self._document.motion.dragging:
             self._grip = self._target = self._deepen = None
             self._show_patch()
@@ -786,7 +789,7 @@ class Mouse(QObject):
         self.redraw_wanted.emit()
 
     def _twisting(self, scene: Scene, start: QPointF, vertex: int) -> _Drag:
-        """Twist a body part about its long axis by the motion across it."""
+        """Twist a body part about its long axis by pointer motion across the axis."""
         from lcollision_core.posing import Twist, long_axis
 
         document, domain = self._document, domain_of(self._document.model, vertex)
@@ -809,7 +812,7 @@ class Mouse(QObject):
         last = start
 
         def turn(place: QPointF) -> None:
-            # From where the camera is now: it may follow the body meanwhile.
+            # Turn the current view: the camera may follow the body meanwhile.
             nonlocal last
             way, last = (place - last) * _DEGREES_PER_PIXEL, place
             self.camera_moved.emit(turned(self._view, way.x(), way.y()))

@@ -1,4 +1,4 @@
-"""Figures of a model: its masks, its evaluation."""
+"""Figures of a model: its attention masks and its evaluation."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ _MARGIN = 50
 
 
 def parts_image(model: Body, width: int, height: int) -> Image.Image:
-    """Draw the same two sides as `draw_masks`, without names, on nothing.
+    """Draw the same two sides as `draw_masks`, without names, on a transparent background.
 
     Parameters
     ----------
-    width, height : of both together, in pixels
+    width, height : of the whole picture, in pixels
     """
     picture = Image.new("RGBA", (width, height))
     renderer = PoseRenderer(model, width // 2, height, LIGHT, transparent=True)
@@ -41,12 +41,12 @@ def parts_image(model: Body, width: int, height: int) -> Image.Image:
 
 
 def draw_masks(model: Body, path: str | os.PathLike[str]) -> None:
-    """Draw the reference from two sides, each domain in its colour, stronger where it owns more.
+    """Draw the rest pose from two sides, each domain in its colour, stronger with larger weight.
 
     Parameters
     ----------
-    model : whose attention masks
-    path : the .png file to write, whole or not at all
+    model : of the attention masks
+    path : the .png file to write, atomically
 
     Raises
     ------
@@ -84,7 +84,7 @@ def draw_masks(model: Body, path: str | os.PathLike[str]) -> None:
 def _paste_sides(
     picture: Image.Image, renderer: PoseRenderer, model: Body, width: int, height: int
 ) -> None:
-    """Draw the front and the back of the reference beside each other, and close the renderer."""
+    """Draw the front and the back of the rest pose side by side, and close the renderer."""
     from lcollision_core.meshes.normals import vertex_normals
 
     scene, vertices = renderer.scene, model.reference.astype(np.float32)
@@ -100,7 +100,7 @@ _COLOUR, _REFERENCE = (18, 64, 133), (150, 150, 150)
 _BOUNDS = np.geomspace(1e-5, 0.5, 400)
 _PERCENT = (0.0, 100.0)
 _CURVE_POINTS = 1000
-"""Of a ROC curve, which has as many steps as there are samples."""
+"""Largest number of points drawn of a ROC curve, which has as many steps as samples."""
 
 
 def save_figures(scored: ScoredRows, path: Path) -> None:
@@ -108,8 +108,8 @@ def save_figures(scored: ScoredRows, path: Path) -> None:
 
     Parameters
     ----------
-    scored : at least one sample, none of which trained the predictor
-    path : of the picture, or of a folder, made if there is none
+    scored : at least one sample, none of them used to train the predictor
+    path : of the picture, or of a folder, made if it does not exist
 
     Raises
     ------
@@ -128,7 +128,7 @@ def save_figures(scored: ScoredRows, path: Path) -> None:
 
 
 def _draw_risk(scored: ScoredRows, path: Path) -> None:
-    """Draw how often the predictor errs among the poses that it is sure of."""
+    """Draw the risk of the predictor by its coverage, the share of poses that it is sure of."""
     ranges = sure_ranges(scored.logit, scored.rows.colliding, _BOUNDS.tolist())
     partial = [sure for sure in ranges if sure.coverage < 1.0]
     risk = [100.0 * sure.error_bound for sure in partial]
@@ -143,7 +143,7 @@ def _draw_risk(scored: ScoredRows, path: Path) -> None:
 
 
 def _draw_roc(scored: ScoredRows, path: Path) -> None:
-    """Draw the colliding poses that are called so by the free ones that are, at each threshold."""
+    """Draw the ROC curve: true positive rate by false positive rate, at each threshold."""
     auc, colliding = scored.auc, scored.rows.colliding
     said = "one class is missing" if auc is None else f"area {auc:.4f}"
     chart = _chart(
@@ -161,7 +161,7 @@ def _draw_roc(scored: ScoredRows, path: Path) -> None:
 
 
 def _draw_calibration(scored: ScoredRows, path: Path) -> None:
-    """Draw the share of samples that collide by the predicted probability."""
+    """Draw the share of colliding samples by the predicted probability."""
     metrics = scored.metrics()
     bins = [entry for entry in metrics.calibration if entry.probability is not None]
     chart = _chart(

@@ -1,4 +1,4 @@
-"""What explains the mesh: the legend beneath it, and the name of the domain under the pointer."""
+"""The legend of the colours, and the tag of the domain under the pointer."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _RAMP_WIDTHS, _RAMP_HEIGHT = (100, 168), 10
 
 
 class LegendStrip(QWidget):
-    """Explains the colours beneath the mesh, in blocks that go on below where a row is full.
+    """The legend of the colours below the view, in blocks that wrap into rows.
 
-    Its rows are kept while only numbers change, so that the mesh beside it stays in its place.
-    Where there is nothing to explain it is hidden.
+    While only numbers change, the number of rows does not shrink, so that the mesh stays in place.
+    The strip is hidden if there is nothing to explain.
 
     Parameters
     ----------
-    parent : beneath whose mesh it lies
+    parent : of the widget
     """
 
     def __init__(self, parent: QWidget) -> None:
@@ -61,7 +61,7 @@ class LegendStrip(QWidget):
         self.hide()
 
     def set_legend(self, legend: Legend) -> None:
-        """Explain something else."""
+        """Show another legend."""
         if legend == self.legend:
             return
         is_other = legend.title != self.legend.title
@@ -80,20 +80,20 @@ class LegendStrip(QWidget):
         return QSize(0, super().minimumSizeHint().height())
 
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
-        """Fit the blocks into the width that there is."""
+        """Fit the blocks into the new width."""
         super().resizeEvent(event)
         if event.size().width() != event.oldSize().width():
             self._fit()
 
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
-        """Fit another font."""
+        """Fit the blocks to another font."""
         super().changeEvent(event)
         if event.type() in (QEvent.Type.FontChange, QEvent.Type.ApplicationFontChange):
             self._fit()
 
     def _fit(self, anew: bool = True) -> None:
-        """Take the rows that are needed; unless `anew`, no fewer than before."""
-        # As wide as with the unit: notes change with the pose and must not add a row.
+        """Wrap the blocks into rows; unless `anew`, no fewer than before."""
+        # At least as wide as the unit: a note changes with the pose and must not add a row.
         width = self._note.fontMetrics().horizontalAdvance
         needed = max(width(self.legend.note), width(UNIT)) + 1
         self._note.setWordWrap(NORMAL + needed + CLOSE > self.width())
@@ -110,7 +110,7 @@ class LegendStrip(QWidget):
             if not is_shown:
                 continue
             needed = block.minimumSizeHint().width()
-            # Cut off where it is alone in a row and still too wide.
+            # A block wider than the strip is cut off.
             block.setMinimumWidth(int(NORMAL + needed + CLOSE > self.width()))
             if rows[-1] and used + needed > self.width():
                 rows.append([])
@@ -130,7 +130,7 @@ class LegendStrip(QWidget):
 
 
 class _Ramp(QWidget):
-    """A scale of colours over its numbers."""
+    """A colour scale above its tick labels."""
 
     def __init__(self, parent: QWidget) -> None:
         super().__init__(parent)
@@ -153,7 +153,7 @@ class _Ramp(QWidget):
         return QSize(round(width + self._beyond()), 2 * self.fontMetrics().height())
 
     def _beyond(self) -> float:
-        """Return how far the last number reaches beyond the scale; short words end with it."""
+        """Return how far the last tick label extends beyond the scale; with two ticks, 0."""
         ticks = self._legend.ticks
         return 0.5 * self.fontMetrics().horizontalAdvance(ticks[-1][1]) if len(ticks) > 2 else 0.0
 
@@ -174,7 +174,7 @@ class _Ramp(QWidget):
         painter.setPen(QColor(current_theme().muted))
         for position, words in legend.ticks:
             width = QFontMetricsF(self.font()).horizontalAdvance(words)
-            # Beneath its position, but for words at the ends, which are flush with them.
+            # Centre labels at their ticks; align those at the ends with the scale.
             flush = position if position == 0.0 or len(legend.ticks) == 2 else 0.5
             area = QRectF(position * bar.width() - flush * width, half, width + 2, half)
             painter.drawText(area, Qt.AlignmentFlag.AlignVCenter, words)
@@ -182,11 +182,11 @@ class _Ramp(QWidget):
 
 
 class DomainTag(QLabel):
-    """Names the domain under the pointer, beside it.
+    """The name of the domain under the pointer, shown beside it.
 
     Parameters
     ----------
-    parent : over which it lies
+    parent : widget that the tag overlays
     """
 
     def __init__(self, parent: QWidget) -> None:
@@ -209,5 +209,5 @@ class DomainTag(QLabel):
 
 
 def with_swatch(name: str, colour: str) -> str:
-    """Return a name behind a square of a colour, as rich text."""
+    """Return a name after a square of a colour, as rich text."""
     return f"<span style='color: {colour}'>&#9632;</span>&nbsp; {html.escape(name)}"

@@ -1,4 +1,4 @@
-"""What is drawn on and round a body: marks, highlights, outlines, motion paths."""
+"""Marks on and around a body: pins, contacts, highlights, outlines and motion paths."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 PIN_RADIUS = 7.0
-"""Of a pin's dot with its rim, in device-independent pixels."""
+"""Radius of a pin's dot with its rim, in device-independent pixels."""
 
 ARROW_LENGTH = 70.0
-"""Of the arrows along the axes, in device-independent pixels."""
+"""Length of the arrows along the axes, in device-independent pixels."""
 
 AXIS_COLOURS = ("#e5484d", "#46a758", "#3e7bfa")
-"""Of the body's left, front and up."""
+"""Colours of the body's left, front and up axes."""
 
 _CONTACT_RADIUS, _STANDING_RADIUS = 6.0, 4.5
 _APART = 16.0
-"""Pixels between two marks of contact, as what is nearer shares one."""
+"""Least distance between two contact marks, in pixels; nearer contacts share one."""
 
 _TARGET_RADIUS = 0.018
-"""Of the ring round a target, which is smaller far away, and of its shadow: normalised."""
+"""Radius of the ring round a target and of its shadow, in normalised length."""
 
 _DARK, _LIGHT = "#14171c", "#ffffff"
 _SIDES = 24
 
 
 class Marks:
-    """Draws pins, contacts, what stands, the target of a drag with its shadow, and arrows.
+    """Draw pins, handles, contacts, standing points, a drag's target with its shadow, and arrows.
 
     Parameters
     ----------
@@ -79,12 +79,12 @@ class Marks:
     def show_handles(
         self, places: npt.NDArray[Any], colours: Sequence[str], pointed: int | None
     ) -> None:
-        """Draw open dots at (H, 3) points, in colours "#rrggbb"; the pointed one is full."""
+        """Draw open dots at (H, 3) points, in colours "#rrggbb"; the `pointed` one is filled."""
         self.handles, self._handle_colours = np.asarray(places, dtype=np.float64), tuple(colours)
         self._handle = pointed
 
     def show_contacts(self, places: npt.NDArray[Any]) -> None:
-        """Draw rings at (C, 3) points, one for those that are near each other on the screen."""
+        """Draw rings at (C, 3) points, one for several that are close on the screen."""
         self._contacts = np.asarray(places, dtype=np.float64)
 
     def show_standing(self, places: npt.NDArray[Any]) -> None:
@@ -92,20 +92,20 @@ class Marks:
         self._standing = np.asarray(places, dtype=np.float64)
 
     def show_target(self, line: FloatArray | None) -> None:
-        """Draw the target of a drag and how far it is above the ground, or none.
+        """Draw the target of a drag and its height above the ground, or none.
 
         Parameters
         ----------
-        line : (3, 3) array: what is dragged, its target, and the point on the ground below that
+        line : (3, 3) array: the dragged point, its target, and the point on the ground below that
         """
         self._line = line
 
     def show_arrows(self, origin: FloatArray | None, axes: FloatArray) -> None:
-        """Draw arrows from a point along the (3, 3) axes, the rows, or none."""
+        """Draw arrows from a point along the rows of (3, 3) axes, or none."""
         self._arrows = None if origin is None else (origin, axes)
 
     def arrow_at(self, place: Pixel, view: View, size: Pixel) -> int | None:
-        """Return the index of the axis whose arrow is at a place of the picture, or None."""
+        """Return the index of the axis whose arrow is at an image position, or None."""
         if self._arrows is None:
             return None
         start, *tips = self._arrow_places(view, size)
@@ -124,19 +124,19 @@ class Marks:
         return places_of(view, origin + length * np.concatenate([np.zeros((1, 3)), axes]), size)
 
     def pin_at(self, place: Pixel, view: View, size: Pixel) -> int | None:
-        """Return the index of the pin whose dot is at a place of the picture, or None."""
+        """Return the index of the pin whose dot is at an image position, or None."""
         return _dot_at(self.pins, place, view, size)
 
     def handle_at(self, place: Pixel, view: View, size: Pixel) -> int | None:
-        """Return the index of the handle at a place of the picture, or None."""
+        """Return the index of the handle at an image position, or None."""
         return _dot_at(self.handles, place, view, size)
 
     def fit(self, view: View, sharpness: float) -> None:
-        """Follow the camera, just before a picture.
+        """Build the shapes for the camera, just before a picture.
 
         Parameters
         ----------
-        sharpness : device pixels per device-independent one
+        sharpness : device pixel ratio
         """
         width, height = self._renderer.GetSize()
         size = width / sharpness, height / sharpness
@@ -200,7 +200,7 @@ _CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 
 
 def _arrow(start: FloatArray, tip: FloatArray, half: float) -> FloatArray:
-    """Return an arrow with a head, (2, 4, 2)."""
+    """Return an arrow with a head, as (2, 4, 2) quads."""
     neck = start + 0.8 * (tip - start)
     along = tip - start
     aside = 3.0 * half * np.array([-along[1], along[0]]) / max(float(np.linalg.norm(along)), 1e-9)
@@ -209,7 +209,7 @@ def _arrow(start: FloatArray, tip: FloatArray, half: float) -> FloatArray:
 
 
 def _ring(middle: FloatArray, inner: float, outer: float) -> FloatArray:
-    """Return a ring, or a disc where its inner radius is 0, as (n, 4, 2) quadrangles."""
+    """Return a ring, or a disc if its inner radius is 0, as (n, 4, 2) quads."""
     rim, on = _CIRCLE[:-1], _CIRCLE[1:]
     corners = np.stack([inner * rim, outer * rim, outer * on, inner * on])
     quads: FloatArray = middle + corners.transpose(1, 0, 2)
@@ -217,14 +217,14 @@ def _ring(middle: FloatArray, inner: float, outer: float) -> FloatArray:
 
 
 def _bar(start: FloatArray, end: FloatArray, half: float) -> FloatArray:
-    """Return a line of a width as one quadrangle, (1, 4, 2)."""
+    """Return a line of half width `half` as one quad, (1, 4, 2)."""
     along = end - start
     aside = half * np.array([-along[1], along[0]]) / max(float(np.linalg.norm(along)), 1e-9)
     return np.stack([start + aside, start - aside, end - aside, end + aside])[None]
 
 
 def _dot_at(dots: FloatArray, place: Pixel, view: View, size: Pixel) -> int | None:
-    """Return the index of the dot of (n, 3) points at a place of the picture, or None."""
+    """Return the index of the dot, of (n, 3) points, at an image position, or None."""
     if not len(dots):
         return None
     away = np.linalg.norm(places_of(view, dots, size) - np.array(place), axis=1)
@@ -233,7 +233,7 @@ def _dot_at(dots: FloatArray, place: Pixel, view: View, size: Pixel) -> int | No
 
 
 def _thinned(places: FloatArray) -> list[FloatArray]:
-    """Leave out places that are near one before them."""
+    """Leave out positions that are near an earlier one."""
     kept: list[FloatArray] = []
     for place in places:
         if all(np.linalg.norm(place - other) >= _APART for other in kept):
@@ -242,18 +242,18 @@ def _thinned(places: FloatArray) -> list[FloatArray]:
 
 
 _OPACITY = 0.32
-"""Of the nearest frame that shows through; the others fade."""
+"""Base opacity of the nearest onion skin; the others fade."""
 
 
 class MotionMarks:
-    """Onion skins and a path, in one renderer.
+    """Onion skins and a motion path.
 
-    Skins before the playhead have the colour of what is free, those after it that of what invites:
-    both differ in hue and in lightness.
+    Skins before the playhead have the theme's colour for free, those after it the accent colour:
+    these differ in hue and in lightness.
 
     Parameters
     ----------
-    renderer : drawn into
+    renderer : to draw in
     model : of the frames
     theme : whose colours are used
     """
@@ -264,17 +264,17 @@ class MotionMarks:
         self._path: pv.Actor | None = None
 
     def set_theme(self, theme: Theme) -> None:
-        """Apply the colours of a theme, from the next time on."""
+        """Apply the colours of a theme: to the path now, to the skins when next shown."""
         self._theme = theme
         if self._path is not None:
             self._path.prop.color = theme.accent
 
     def show_skins(self, frames: Sequence[tuple[int, PoseFrame]]) -> None:
-        """Let frames show through.
+        """Draw frames as onion skins.
 
         Parameters
         ----------
-        frames : how far each is from the playhead, and the frame; the nearest first
+        frames : offset from the playhead, and the frame; the nearest first
         """
         while len(self._skins) < len(frames):
             self._skins.append(self._new_skin())
@@ -313,20 +313,20 @@ _TO_THE_FRONT = -3.0e7  # in steps of a depth buffer of 24 bits: all of its rang
 
 
 class FaceHighlight:
-    """Some faces of a surface, drawn over it; they follow its vertices.
+    """Highlighted faces of a surface, drawn over it; they follow its vertices.
 
     Parameters
     ----------
     surface : whose vertices are drawn
     faces : (F, 3) array, all faces of the mesh
     colour : "#rrggbb"
-    layer : of two highlights of one face, that of the higher layer is seen; from 1
+    layer : from 1; of two highlights of one face, the higher layer is visible
 
     Attributes
     ----------
-    hidden : (F,) array, whether each face is drawn neither here nor on the body; None for none
-    nearer, through : actors to be added to a renderer; what lies behind something, as on the far
-        side or inside a limb, shines through
+    hidden : (F,) bool array, the faces that are not drawn; None for none
+    nearer, through : actors to be added to a renderer; the second shows occluded faces, on the far
+        side or inside a limb, translucently through the body
     """
 
     def __init__(
@@ -340,7 +340,7 @@ class FaceHighlight:
         self.through = actor_of(
             self._polydata, color=colour, opacity=_THROUGH_OPACITY, lighting=False
         )
-        # The same triangles are in the body: without an offset, rounding decides which is seen.
+        # The body has the same triangles: without an offset, rounding decides which are visible.
         for actor, offset in (
             (self.nearer, (-1.0 * layer, -2.0 * layer)),
             (self.through, (0.0, _TO_THE_FRONT)),
@@ -350,7 +350,7 @@ class FaceHighlight:
             actor.SetVisibility(False)
 
     def show(self, faces: npt.NDArray[np.integer] | None) -> None:
-        """Draw faces, given by number in an array of any shape, None for no face."""
+        """Draw the faces whose indices are in an array of any shape; None for none."""
         chosen = np.unique(faces) if faces is not None else np.empty(0, dtype=np.int64)
         if self.hidden is not None:
             chosen = chosen[~self.hidden[chosen]]
@@ -359,13 +359,13 @@ class FaceHighlight:
         self._set_visible(len(chosen) > 0)
 
     def look_like(self, other: FaceHighlight) -> None:
-        """Show the faces that another one of the same mesh shows."""
+        """Show the faces of another highlight of the same mesh."""
         self._polydata.SetPolys(other._polydata.GetPolys())
         self._set_visible(other.n_faces > 0)
 
     @property
     def n_faces(self) -> int:
-        """How many faces are drawn."""
+        """Number of faces drawn."""
         return int(self._polydata.GetNumberOfPolys()) if self.nearer.GetVisibility() else 0
 
     def _set_visible(self, visible: bool) -> None:
@@ -376,25 +376,25 @@ class FaceHighlight:
 Float32Array = npt.NDArray[np.float32]
 
 _STROKES = ((1.4, "#ffffff", 9.0), (3.0, "#14171c", 6.0))
-"""Width to each side, colour, and how much before the skin the border is drawn that lies in it,
-both in device-independent pixels; the inner first: seen on any colour."""
+"""Width to each side, colour, and offset of the border towards the camera, of the inner and outer
+stroke, visible on any colour; lengths in device-independent pixels."""
 
 _SMOOTHINGS = 4
 
 _BORDER_WIDTH = 1.5
-"""Times the width to one side: on the body a line of both sides would look heavier than the rim."""
+"""Line width of the border over the width to one side; 2 would look heavier than the rim."""
 
 
 @dataclass(frozen=True, eq=False)
 class PartShape:
-    """The region of the mesh that a body part is, whatever the pose.
+    """The region of a body part on the mesh, independent of the pose.
 
     Attributes
     ----------
     ends : (P, 2) integer array, the mesh edges that the border of the part crosses
-    fractions : (P, 1) float32 array, where: 0 at the first end, 1 at the second
+    fractions : (P, 1) float32 array, where the border crosses: 0 at the first end, 1 at the second
     segments : (S, 2) integer array, pieces of the border between those P points
-    vertices : (Q,) integer array, the vertices of faces that are all the part's
+    vertices : (Q,) integer array, the vertices of faces that are wholly inside the part
     faces : (F, 3) integer array, these faces, as indices into `vertices`
     """
 
@@ -408,7 +408,7 @@ class PartShape:
     def of(
         cls, attention_mask: npt.NDArray[Any], faces: npt.NDArray[Any], domain: int
     ) -> PartShape:
-        """Find the vertices where a domain has the largest weight, and their border.
+        """Find the region where a domain has the largest weight, and its border.
 
         Parameters
         ----------
@@ -420,12 +420,12 @@ class PartShape:
         others = np.delete(attention_mask, domain, axis=0).max(axis=0, initial=0.0)
         lead = _smooth(own - others, faces)
         if not (lead > 0.0).any():
-            # It has the largest weight nowhere: its region is where its weight is large.
+            # The domain dominates nowhere: take the region where its weight is large.
             lead = own - 0.5 * own.max()
         inside = (lead > 0.0)[faces]
         count = inside.sum(axis=1)
         crossed = np.flatnonzero((count == 1) | (count == 2))
-        # The corner that is alone on its side: the border leaves the face by its two edges.
+        # Find the corner that is alone on its side: the border crosses its two edges.
         alone = (inside[crossed] == (count[crossed] == 1)[:, None]).argmax(axis=1)
         corner, after, before = (
             faces[crossed, (alone + step) % 3].astype(np.int64) for step in range(3)
@@ -451,10 +451,10 @@ class PartShape:
 
 
 class Outline:
-    """Draws a part's border on the body and the rim of its silhouette, in a constant width.
+    """Draw a part's border on the body and the rim of its silhouette, in a constant width.
 
-    The rim is the part's own skin, a little larger, with only its back faces drawn: where
-    the body does not hide it, it stands out round the part. The colours of the mesh do not change.
+    The rim is the part's surface, slightly enlarged, with only its back faces drawn: it stands out
+    round the part unless the body hides it. The colours of the mesh do not change.
 
     Parameters
     ----------
@@ -468,7 +468,7 @@ class Outline:
         for width, colour, nearer in _STROKES:
             border, shell = pv.PolyData(), pv.PolyData()
             line = actor_of(border, color=colour, lighting=False)
-            # Only its far side is seen, beside the part.
+            # Cull front faces: only the far side shows, beside the part.
             rim = actor_of(shell, color=colour, lighting=False, culling="front")
             for actor in (line, rim):
                 actor.SetVisibility(False)
@@ -481,7 +481,7 @@ class Outline:
         return self._shape is not None
 
     def show(self, shape: PartShape | None) -> None:
-        """Outline a part from the next `fit` on, or none."""
+        """Outline a part, from the next `fit` on, or none."""
         self._shape = shape
         for _, _, border, shell, *actors in self._strokes:
             if shape is not None:
@@ -493,12 +493,12 @@ class Outline:
                 actor.SetVisibility(shape is not None)
 
     def fit(self, vertices: Float32Array, normals: Float32Array, sharpness: float) -> None:
-        """Follow the pose and the camera.
+        """Fit the outline to the pose and the camera.
 
         Parameters
         ----------
         vertices, normals : (V, 3) float32 arrays
-        sharpness : device pixels per device-independent one
+        sharpness : device pixel ratio
         """
         shape = self._shape
         if shape is None:
@@ -517,7 +517,7 @@ class Outline:
 
 
 def _smooth(values: npt.NDArray[np.float64], faces: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """Average (V,) values over the faces round each vertex, which smooths a border between them."""
+    """Smooth (V,) values by averaging over the faces round each vertex."""
     corners = faces.ravel()
     n_faces = np.maximum(np.bincount(corners, minlength=len(values)), 1)
     for _ in range(_SMOOTHINGS):

@@ -28,30 +28,30 @@ if TYPE_CHECKING:
 UInt8Array = npt.NDArray[np.uint8]
 
 _NOTHING = "#000000"
-"""Behind a cut-out picture: adds nothing to the pixels that a rim covers in part."""
+"""Background of a transparent picture: black adds nothing to partly covered pixels at the rim."""
 
 _CHART = (900, 620)
 
 _FINEST = 512 * 512
-"""Pixels: up to this size a picture is drawn 16 times as large and shrunk."""
+"""Largest picture, in pixels, that is supersampled, at 16 times its size."""
 
 
 def off_screen_plotter(width: int, height: int) -> pv.Plotter:
-    """Return what draws into a picture, for the thread of the window."""
+    """Return an off-screen plotter, for use in the GUI thread."""
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkLogger
 
-    # Without a display VTK warns of that, then draws all the same.
+    # Without a display, VTK warns, but draws all the same.
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
     return pv.Plotter(off_screen=True, window_size=(width, height), lighting="light kit")
 
 
 def save_chart(chart: pv.Chart2D, path: str | os.PathLike[str]) -> None:
-    """Draw a chart on white as a PNG, whole or not at all.
+    """Draw a chart on white and write it as a PNG file atomically.
 
     Raises
     ------
-    MeshFileError : it cannot be written.
+    MeshFileError : the file cannot be written.
     """
     from PIL import Image
 
@@ -64,14 +64,14 @@ def save_chart(chart: pv.Chart2D, path: str | os.PathLike[str]) -> None:
 
 
 class PoseRenderer:
-    """Draws poses of one model into pictures; for the thread of the window.
+    """Render poses of one model into pictures, in the GUI thread.
 
     Parameters
     ----------
     model : of all poses
     width, height : in pixels
     theme : whose colours are used
-    transparent : nothing but the mesh, without a background
+    transparent : whether to draw only the mesh, without a background
     """
 
     def __init__(
@@ -91,28 +91,28 @@ class PoseRenderer:
             self.scene.set_plain_background(_NOTHING)
 
     def drawn(self) -> Image:
-        """Draw the scene as it is, in RGBA where it is `transparent` and else in RGB."""
+        """Render the current scene, in RGBA if `transparent`, else in RGB."""
         return picture_of(self.pixels())
 
     def pixels(self) -> UInt8Array:
-        """Draw the scene as it is, (H, W, C), for `picture_of` in any thread."""
-        # Otherwise pyvista returns the picture before.
+        """Render the current scene, (H, W, C), for `picture_of` in any thread."""
+        # Otherwise pyvista returns the previous picture.
         self._plotter.render()
         return np.array(
             self._plotter.screenshot(return_img=True, transparent_background=self._transparent)
         )
 
     def close(self) -> None:
-        """Free the picture's memory on the graphics card."""
+        """Free the graphics memory."""
         self._plotter.close()
 
 
 def picture_of(pixels: UInt8Array) -> Image:
-    """Return a picture of `PoseRenderer.pixels`, which may change."""
+    """Return a picture of `PoseRenderer.pixels`, which may be changed in place."""
     from PIL import Image
 
     if pixels.shape[2] == 4:
-        # Pixels of a rim get the colour of what covers them, without the black behind it.
+        # Remove the black background from the colour of partly covered pixels.
         for row in pixels:
             alpha = np.maximum(row[:, 3:], 1).astype(np.float32)
             row[:, :3] = np.minimum(row[:, :3] * (255.0 / alpha), 255.0)
@@ -120,7 +120,7 @@ def picture_of(pixels: UInt8Array) -> Image:
 
 
 def save_png(picture: Image, path: str | os.PathLike[str]) -> None:
-    """Write a picture as a .png file, whole or not at all.
+    """Write a picture as a .png file atomically.
 
     Raises
     ------
@@ -129,31 +129,31 @@ def save_png(picture: Image, path: str | os.PathLike[str]) -> None:
     from lcollision_core.files import atomic_write
 
     with atomic_write(path) as file:
-        # Level 6, the default, takes seconds for a large picture and saves little.
+        # The default, level 6, takes seconds for a large picture and saves little.
         picture.save(file, format="PNG", compress_level=3)
 
 
 FORMATS = (".gif", ".webp", ".png")
-"""A GIF has 256 colours, a WebP all of them, and PNG is a folder of numbered pictures."""
+"""Video formats: GIF with 256 colours, WebP with all, PNG as a folder of numbered pictures."""
 
 FASTEST_GIF = 50
-"""Frames a second: a GIF counts in hundredths of a second, and players slow down one of 1."""
+"""Highest frame rate of a GIF: durations are in 1/100 s, and players slow down those of 1/100 s."""
 
 _MOST_BYTES = 2**31
-"""Most bytes of all frames of a GIF or a WebP, which stay in memory until it is packed."""
+"""Most bytes of all frames of a GIF or a WebP, which stay in memory until encoded."""
 
 
 @dataclass(frozen=True)
 class TurntableStyle:
-    """How a turntable video looks.
+    """The style of a video.
 
     Attributes
     ----------
-    seconds : that one turn lasts
+    seconds : duration of one turn
     width, height : in pixels
-    rate : frames a second
+    rate : frames per second
     background : "shown" as in the window, "plain" for one colour, or "transparent", which a GIF
-        cannot be; the last two leave the floor out
+        cannot be; the last two leave out the floor
     colour : "#rrggbb", of a plain background
     """
 
@@ -166,16 +166,19 @@ class TurntableStyle:
 
     @property
     def n_frames(self) -> int:
-        """How many frames one turn has."""
+        """Number of frames."""
         return max(2, round(self.seconds * self.rate))
 
     def durations(self, unit: int) -> list[int]:
-        """Return each frame's milliseconds, in multiples of a unit that add up to the turn."""
+        """Return each frame's duration in milliseconds, a multiple of `unit`.
+
+        Rounding errors do not add up over the video.
+        """
         ends = np.arange(self.n_frames + 1) * (1000.0 / self.rate / unit)
         return [int(unit * step) for step in np.diff(np.round(ends))]
 
     def refusal(self, path: Path) -> MeshFileError | None:
-        """Return why a video cannot be written in this style, or None if it can."""
+        """Return an error that says why a video of this style cannot be written, or None."""
         suffix = path.suffix.lower()
         where: str | Path = path.name
         n_bytes = self.n_frames * self.width * self.height * (1 if suffix == ".gif" else 4)
@@ -199,13 +202,13 @@ class TurntableStyle:
 
 
 class TurntableVideo:
-    """Draws a turntable video frame by frame; what is drawn is then packed, in any thread.
+    """Draw a turntable video frame by frame; the frames are then encoded in any thread.
 
     Parameters
     ----------
-    renderer : whose scene is set up for the first frame; closed with the video
-    path : the file to write, whole or not at all; "turn.png" stands for a new folder "turn"
-    style : of the video; the renderer is of its size and background
+    renderer : its scene is set up for the first frame; closed with the video
+    path : the file to write, atomically; "turn.png" stands for a new folder "turn"
+    style : of the video; the renderer has its size and background
     """
 
     def __init__(self, renderer: PoseRenderer, path: Path, style: TurntableStyle) -> None:
@@ -215,13 +218,13 @@ class TurntableVideo:
         self.path = path.with_suffix("") if self._format == "PNG" else path
         self.n_drawn, self.n_frames = 0, style.n_frames
         self._frames: list[Image] = []
-        # Of a PNG sequence, whose frames need not wait in memory.
+        # For a PNG sequence, whose frames are written as they are drawn.
         self._unfinished = ExitStack()
         self._folder: Path | None = None
         self._packing = Lock()
 
     def draw_next(self) -> None:
-        """Draw one more frame; in the thread of the window."""
+        """Draw the next frame, in the GUI thread."""
         from PIL.Image import Dither
 
         self._set_up(self.n_drawn)
@@ -233,18 +236,18 @@ class TurntableVideo:
                 self._unfinished.close()
             return
         if self._format == "GIF":
-            # One palette for all frames: separate palettes would flicker.
+            # Use one palette for all frames: separate palettes would flicker.
             palette = self._frames[0] if self._frames else picture.quantize(dither=Dither.NONE)
             picture = picture.quantize(palette=palette, dither=Dither.NONE)
         self._frames.append(picture)
 
     def _set_up(self, number: int) -> None:
-        """Bring the scene to one frame; the first is as the scene is."""
+        """Set up the scene for a frame; the first is the current scene."""
         if number:
             self._renderer.scene.turn_camera(360.0 / self.n_frames)
 
     def _keep(self, picture: Image) -> None:
-        """Write a frame of a PNG sequence, which comes into its folder with all others."""
+        """Write a frame of a PNG sequence; all frames appear in the folder at once."""
         from lcollision_core.files import atomic_files
 
         if self._folder is None:
@@ -260,11 +263,11 @@ class TurntableVideo:
         self._unfinished.__exit__(CancelledError, incomplete, None)
 
     def pack(self, job: Job) -> str:
-        """Write the video once all of it is drawn, and return a message; a `Job`."""
+        """Write the video once all frames are drawn, and return a message; runs as a job."""
         from lcollision_core.files import atomic_write
 
         if self._format != "PNG":
-            # One thread at a time: saving changes a picture of Pillow's.
+            # One thread at a time: Pillow's `save` changes the picture.
             with self._packing, atomic_write(self.path) as file:
                 self._frames[0].save(
                     file,
@@ -280,13 +283,13 @@ class TurntableVideo:
 
 
 class MotionVideo(TurntableVideo):
-    """Draws a video of a motion, likewise, from where the camera is.
+    """Draw a video of a motion from the current camera; see `TurntableVideo`.
 
     Parameters
     ----------
     renderer, path, style : see `TurntableVideo`
     model : of the motion
-    motion : as many frames as the video has
+    motion : with as many frames as the video
     follows : whether the camera moves along with the body
     """
 

@@ -1,4 +1,4 @@
-"""Screenshots and turntable videos of what a viewport shows, in other sizes."""
+"""Screenshots and videos of a viewport's scene, in any size."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ if TYPE_CHECKING:
     from lcollision_core.motion import Motion
 
 _MOST_PIXELS = 2**25
-"""Of a screenshot: drawing takes about 80 bytes of memory for each."""
+"""Largest screenshot, in pixels: rendering takes about 80 bytes of memory per pixel."""
 
 
 class Pictures(QObject):
-    """Copies a viewport's scene off the screen, and writes what is seen of it.
+    """Render copies of a viewport's scene off screen, and write them to files.
 
-    Frames of a video are drawn one by one between the window's own events; the document's long
-    worker packs them.
+    The frames of a video are drawn one by one between the window's events; the document's worker
+    for long work encodes them.
 
     Parameters
     ----------
-    document : whose mesh the scene shows; tells the user what has been saved
-    scene_now : returns the scene as it is to be seen, or raises if there is none yet
+    document : whose mesh the scene shows; emits messages on saved files
+    scene_now : returns the updated scene, or raises if there is none yet
     parent : of the object
 
     Signals
     -------
-    busy_changed : `busy` may be another
+    busy_changed : `busy` may have changed
     """
 
     busy_changed = Signal()
@@ -59,29 +59,29 @@ class Pictures(QObject):
         self._document = document
         self._scene_now = scene_now
         self._video: TurntableVideo | None = None
-        # With 0 ms between two frames the window's own events are still processed.
+        # Even with 0 ms between two frames, the window's events are processed.
         self._next = QTimer(self, interval=0)
         self._next.timeout.connect(self._on_next)
 
     @property
     def busy(self) -> str:
-        """Which video is being drawn, or "" if none is."""
+        """Description of the video being drawn, or "" if there is none."""
         return f"Making {self._video.path.name}" if self._video is not None else ""
 
     def screenshot(
         self, path: str | os.PathLike[str], width: int, height: int, transparent: bool
     ) -> None:
-        """Draw what is seen, without legend, in another size; the document's long worker saves it.
+        """Render the scene in a given size; the document's worker for long work saves it.
 
         Parameters
         ----------
         path : a .png file
-        width, height : in pixels; as much is seen from bottom to top as in the window
-        transparent : without background, floor and shadow
+        width, height : in pixels; the vertical field of view is that of the window
+        transparent : whether to leave out background, floor and shadow
 
         Raises
         ------
-        MeshFileError : so many pixels would not fit into the memory.
+        MeshFileError : the picture has too many pixels for the memory.
         """
         path = Path(path)
         if width * height > _MOST_PIXELS:
@@ -98,20 +98,20 @@ class Pictures(QObject):
         self._document.tasks.write(f"Saving {path.name}", partial(_save, pixels, path))
 
     def turntable(self, path: str | os.PathLike[str], style: TurntableStyle) -> None:
-        """Begin a video of one turn round what is seen, in place of one that is being drawn.
+        """Start a video of one full turn round the body, replacing one that is being drawn.
 
-        The document tells when it is saved.
+        The document emits a message once it is saved.
 
         Parameters
         ----------
-        path : a .gif or .webp file, or a .png one, whose name without that a new folder of
-            numbered pictures gets
-        style : its size, rate and background
+        path : a .gif or .webp file; a .png file stands for a new folder of numbered pictures with
+            its stem as name
+        style : size, rate and background
 
         Raises
         ------
-        MeshFileError : the format is unknown or cannot hold what `style` asks for, or the folder
-            of a PNG sequence is there already.
+        MeshFileError : the format is unknown or does not support `style`, or the folder of a PNG
+            sequence exists already.
         """
         self._film(Path(path), style, None)
 
@@ -122,11 +122,11 @@ class Pictures(QObject):
         motion: Motion,
         follows: bool = False,
     ) -> None:
-        """Begin a video of a motion's frames, seen as the body is now; see `turntable`.
+        """Start a video of a motion from the current camera; see `turntable`.
 
         Parameters
         ----------
-        motion : as many frames as the video has
+        motion : with as many frames as the video
         follows : whether the camera moves along with the body
         """
         self._film(Path(path), style, motion, follows)
@@ -145,7 +145,7 @@ class Pictures(QObject):
         if motion is None:
             self._video = TurntableVideo(renderer, path, style)
         else:
-            # What crosses in the frame that is seen now crosses in no other.
+            # The crossing faces are those of the current frame only.
             renderer.scene.crossing.show(None)
             renderer.scene.uncounted.show(None)
             renderer.scene.show_ghost(None)
@@ -156,7 +156,7 @@ class Pictures(QObject):
 
     @Slot()
     def cancel(self) -> None:
-        """Cancel the video that is being drawn."""
+        """Cancel the video being drawn."""
         if self._video is not None:
             self._end().close()
             self._document.message.emit("The video was cancelled")
@@ -185,7 +185,7 @@ class Pictures(QObject):
             return
         self._document.message.emit(f"Video: frame {video.n_drawn} of {video.n_frames}")
         if video.n_drawn == video.n_frames:
-            # Before it ends, as a window that closes waits for one or the other.
+            # Start writing before drawing ends: a closing window waits while either is busy.
             self._document.tasks.write(label, video.pack)
             self._end().close()
 

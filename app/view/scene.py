@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 _GHOST_OPACITY = 0.4
 _GHOST_NEAR, _GHOST_FAR = 0.004, 0.015
-"""Normalised distances from the body at which the ghost begins to show and shows in full."""
+"""Normalised distances from the body at which the ghost starts to appear and is fully shown."""
 
 _FLOOR_RADIUS = 0.62
 
 
 class Scene:
-    """Fills a plotter's renderer, on the screen or off it.
+    """Draw a body in a plotter's renderer, on or off screen.
 
     Parameters
     ----------
@@ -36,9 +36,9 @@ class Scene:
 
     Attributes
     ----------
-    crossing, uncounted : the faces that intersect another, and those of pairs that do not count
-    named : the faces of what a list names
-    motion : the frames of a motion that show through, and the path of a point
+    crossing, uncounted : faces of colliding pairs, and of pairs that do not count
+    named : faces selected in a list
+    motion : onion skins and the motion path of a point
     """
 
     def __init__(self, plotter: pv.BasePlotter, model: Body, theme: Theme) -> None:
@@ -103,20 +103,20 @@ class Scene:
             actor.SetVisibility(shown)
 
     def set_ground(self, level: float | None, *, sinks: bool = False) -> None:
-        """Keep the floor where it is, whatever the body does.
+        """Fix the height of the floor.
 
         Parameters
         ----------
-        level : its height; None lays it beneath the body
-        sinks : it goes down with the lowest body shown from now on, as of a motion
+        level : its height; None lays it beneath each pose, or starts anew if it `sinks`
+        sinks : whether the floor goes down to the lowest pose shown from now on, as for a motion
         """
         self._ground, self._sinks = level, sinks
-        # What is on the screen may be of before the motion.
+        # With `sinks`, wait for the next pose: the current one may be from before the motion.
         if self._is_shown and not sinks and self._floor.GetVisibility():
             self._lay_floor()
 
     def set_plain_background(self, colour: str) -> None:
-        """Put one colour, "#rrggbb", behind everything, as pictures to be cut out need it."""
+        """Set a background of one colour, "#rrggbb", as for transparent pictures."""
         self._renderer.set_background(colour)
 
     def show(
@@ -145,11 +145,11 @@ class Scene:
             self._lay_floor()
 
     def paint(self, colours: npt.NDArray[np.uint8]) -> None:
-        """Colour the mesh where it is; (V, 3) uint8 array."""
+        """Colour the mesh, by a (V, 3) uint8 array, without moving it."""
         self.surface.colours[:] = colours
 
     def show_textured(self, textured: bool) -> None:
-        """Draw the body as it looks, where that is known, or in the colours of `paint`."""
+        """Draw the body textured, if it has an appearance, or in the colours of `paint`."""
         if textured == self.is_textured:
             return
         if textured and self._textured is None:
@@ -170,11 +170,11 @@ class Scene:
 
     @property
     def is_textured(self) -> bool:
-        """Whether the body is drawn as it looks."""
+        """Whether the body is drawn textured."""
         return not self.body.GetVisibility()
 
     def hide_faces(self, hidden: npt.NDArray[np.bool_] | None) -> None:
-        """Draw all faces but some: (F,) bool array, None for none."""
+        """Hide faces, a (F,) bool array; None shows all."""
         self._hidden = hidden
         shown = self._faces if hidden is None else self._faces[~hidden]
         for surface in (self.surface, self._ghost):
@@ -192,7 +192,7 @@ class Scene:
     def show_ghost(
         self, vertices: npt.NDArray[Any] | None, normals: npt.NDArray[Any] | None = None
     ) -> None:
-        """Draw a translucent second pose, or none; (V, 3) arrays."""
+        """Draw a translucent second pose, (V, 3) arrays, or none."""
         if vertices is not None:
             self._ghost.vertices[:] = vertices
             self._ghost.normals[:] = normals
@@ -200,7 +200,7 @@ class Scene:
         self._ghost_actor.SetVisibility(vertices is not None)
 
     def outline_domain(self, domain: int | None) -> None:
-        """Outline a domain, by its index from 0, or none."""
+        """Outline a domain, given by its index from 0, or none."""
         faces = self._faces if self._hidden is None else self._faces[~self._hidden]
         shape = None if domain is None else PartShape.of(self._mask, faces, domain)
         self.outline.show(shape)
@@ -210,28 +210,28 @@ class Scene:
 
         Returns
         -------
-        changed : whether that is another one than before
+        changed : whether the grip differs from the previous one
         """
         return self._patch.show(grip)
 
     def fit_to_screen(self, sharpness: float) -> None:
-        """Let what follows the pose and the camera do so, just before a picture.
+        """Fit outline, patch, marks and shadow to the pose and camera, just before a picture.
 
         Parameters
         ----------
-        sharpness : device pixels per device-independent one
+        sharpness : device pixel ratio
         """
-        # Plain arrays: pyvista takes what is cut from its own for the whole.
+        # Use plain arrays: pyvista treats slices of its own arrays as the whole.
         vertices, normals = np.asarray(self.surface.vertices), np.asarray(self.surface.normals)
         self.outline.fit(vertices, normals, sharpness)
         self._patch.fit(sharpness)
         self.marks.fit(self.view, sharpness)
-        # From below, the floor is not seen either.
+        # Hide the shadow from below, where the floor is culled too.
         is_above = self.view.position[self._up_axis] > self._floor.position[self._up_axis]
         self._shadow.SetVisibility(bool(is_above and self._floor.GetVisibility()))
 
     def look_like(self, other: Scene) -> None:
-        """Show what another scene of the same mesh shows, from where it is looked at."""
+        """Copy the content and the camera of another scene of the same mesh."""
         self.hide_faces(other._hidden)
         self.show_textured(other.is_textured)
         self.show(other.surface.vertices, other.surface.normals, other.surface.colours)
@@ -248,7 +248,7 @@ class Scene:
 
     @property
     def view(self) -> View:
-        """From where the camera looks."""
+        """The camera."""
         camera = self._renderer.camera
         return View(*(np.array(at) for at in (camera.position, camera.focal_point, camera.up)))
 
@@ -258,18 +258,18 @@ class Scene:
         camera.position, camera.focal_point, camera.up = view.position, view.focus, view.up
         camera.view_angle = VIEW_ANGLE
         self._renderer.ResetCameraClippingRange()
-        # Otherwise pyvista turns the camera to a default view at the first picture.
+        # Otherwise pyvista resets the camera to a default view in the first picture.
         self._renderer.camera_set = True
 
     def turn_camera(self, degrees: float) -> None:
-        """Turn the camera round its focus, about its up direction."""
+        """Turn the camera around its focus, about its up direction."""
         self._renderer.camera.Azimuth(degrees)
         self._renderer.ResetCameraClippingRange()
 
     def _fade_ghost(self) -> None:
         """Show the ghost only where the body has moved away from it.
 
-        Where both coincide, patches of one and of the other would be seen.
+        If both coincided, patches of either would show at random.
         """
         away = np.linalg.norm(self._ghost.vertices - self.surface.vertices, axis=1)
         away /= self._body_size
@@ -293,7 +293,7 @@ class Scene:
 def _rows_in(
     rows: npt.NDArray[np.integer], wanted: npt.NDArray[np.integer]
 ) -> npt.NDArray[np.bool_]:
-    """Return which of (n, 3) rows are among (m, 3) others."""
+    """Return a mask of the (n, 3) rows that are among the (m, 3) `wanted` rows."""
     kind = np.dtype((np.void, 3 * np.dtype(np.int64).itemsize))
     one, other = (
         np.ascontiguousarray(entries, dtype=np.int64).view(kind) for entries in (rows, wanted)

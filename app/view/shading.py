@@ -1,4 +1,4 @@
-"""Colours of the view: palettes, and shading by parts, depth or a prediction."""
+"""Colours of the view and the themes: palettes, and shading by body part, overlap or movement."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ ColourArray = npt.NDArray[np.uint8]
 FloatArray = npt.NDArray[np.float64]
 
 FULL_PREDICTED = 0.02
-"""Square root of a domain's energy, in normalised lengths, that is drawn in full colour; one in 40
-sampled collisions of a body has a domain beyond it."""
+"""Square root of a domain's energy, in normalised length, at the end of the colour scale; it is
+exceeded in one of 40 sampled collisions of a body."""
 
 FULL_EXACT = 0.006
-"""Square root of a vertex's energy, in normalised lengths, in full colour; likewise."""
+"""Square root of a vertex's energy, in normalised length, at the end of the scale; likewise."""
 
 COLLIDING_FACE = "#e0191f"
-"""Faces that intersect another, in both themes."""
+"""Colour of the faces of colliding pairs, in both themes."""
 
 UNCOUNTED_FACE = "#8a3fd1"
-"""Faces that intersect another where the contact rules do not count it, in both themes."""
+"""Colour of the faces of pairs that the contact rules do not count, in both themes."""
 
 NAMED_FACE = "#00a3b4"
-"""Faces of what a list names, in both themes."""
+"""Colour of the faces selected in a list, in both themes."""
 
 CONTACT = "#ffb000"
-"""Marks of where contact holds the body, in both themes."""
+"""Colour of the marks where contact holds the body, in both themes."""
 
 _RAMP_STEPS = 256
 _PATH_STEPS = 16
-"""Steps from one colour of a scale to the next, for measuring their perceived difference."""
+"""Steps between two stops of a scale, for measuring their perceived difference."""
 
 UNIT = "in % of the body size"
 
@@ -51,7 +51,7 @@ class Shading(Enum):
 
 
 _RAMPS = {
-    # Separate hues, so that an estimate is not taken for a measurement.
+    # Use separate hues, so that an estimate is not mistaken for the exact check.
     Shading.PREDICTED: ("#f2a93b", "#cf3f6f", "#5b1a78"),
     Shading.EXACT: ("#7fc4d6", "#2f7fb8", "#1d2c6b"),
     Shading.MOVEMENT: ("#afcb60", "#2f8f5c", "#0d3f3c"),
@@ -59,13 +59,13 @@ _RAMPS = {
 
 
 class Known(NamedTuple):
-    """What is known of a pose; None for what is not, or not yet.
+    """Results for a pose to colour by; None where unknown, or not known yet.
 
     Attributes
     ----------
-    domain_energy : (K,) array, the estimate, in normalised lengths squared
-    vertex_energy : (V,) array, the exact energy, in normalised lengths squared
-    movement : (V,) array, how far Resolve has moved each vertex, in normalised lengths
+    domain_energy : (K,) array, the estimate, in normalised length squared
+    vertex_energy : (V,) array, the exact energy, in normalised length squared
+    movement : (V,) array, each vertex's displacement by Resolve, in normalised length
     """
 
     domain_energy: FloatArray | None = None
@@ -75,15 +75,15 @@ class Known(NamedTuple):
 
 @dataclass(frozen=True)
 class Legend:
-    """What the colours mean.
+    """The content of the legend.
 
     Attributes
     ----------
     title : one line; "" if there is nothing to explain
     note : one line beneath it, or ""
-    crossing : what faces in the colour `COLLIDING_FACE` are, "" if there are none
-    uncounted : likewise of `UNCOUNTED_FACE`
-    ramp : "#rrggbb" from none to most, evenly spread; empty without a scale
+    crossing : meaning of the colour `COLLIDING_FACE`, "" if it is not used
+    uncounted : likewise for `UNCOUNTED_FACE`
+    ramp : "#rrggbb" from least to most, evenly spaced; empty without a scale
     ticks : (position from 0 to 1 along the ramp, text)
     """
 
@@ -96,7 +96,7 @@ class Legend:
 
 
 class Shader:
-    """Colours the vertices of one model.
+    """Colour the vertices of one model.
 
     Parameters
     ----------
@@ -113,9 +113,9 @@ class Shader:
         self._domains = mask_colours(attention_mask, domain_colours)
 
     def colours(self, shading: Shading, known: Known) -> ColourArray:
-        """Colour each vertex: only by what is shown, so that a scale means one thing.
+        """Colour each vertex by the shading alone, so that a scale has one meaning.
 
-        Where its numbers are not known, a scale's lowest colour, the skin's, is everywhere.
+        If its values are not known, the mesh has the lowest colour of the scale, the skin's.
 
         Returns
         -------
@@ -143,19 +143,19 @@ class Shader:
         has_predictor: bool = True,
         excludes: bool = False,
     ) -> Legend:
-        """Explain what `colours` returns for the same arguments.
+        """Return the legend of `colours` for the same arguments.
 
-        Its scale stays while its numbers come and go, so that nothing round it moves.
+        The scale is kept while values are unknown, so that the layout does not jump.
 
         Parameters
         ----------
-        has_predictor : False if no estimate will ever come
-        excludes : whether there are pairs that do not count
+        has_predictor : False if there is never an estimate
+        excludes : whether contact rules exclude pairs
         """
         if shading in (Shading.TEXTURED, Shading.PLAIN):
             return Legend()
         if shading is Shading.DOMAINS:
-            # The panels, and a label at the pointer, name the colours.
+            # The colours are named in the panels and by a tag at the pointer.
             greys, ends = ("#ffffff", "#565b63"), ((0.0, "shared"), (1.0, "alone"))
             note = "stronger colour = only this part"
             return Legend(shading.value, note, ramp=greys, ticks=ends)
@@ -194,7 +194,7 @@ def mask_colours(attention_mask: npt.NDArray[Any], domain_colours: tuple[str, ..
     -------
     colours : (V, 3) uint8 array, red, green, blue
     """
-    # Mixed hues would look like another domain; white cannot.
+    # Mix with white: mixed hues could look like another domain.
     leading = attention_mask.argmax(axis=0)
     weight = attention_mask.max(axis=0)[:, None]
     full = np.array([rgb(colour) for colour in domain_colours], dtype=np.float64)
@@ -204,7 +204,7 @@ def mask_colours(attention_mask: npt.NDArray[Any], domain_colours: tuple[str, ..
 
 @cache
 def ramp(stops: tuple[str, ...]) -> ColourArray:
-    """Make a scale of colours whose every step looks equally large.
+    """Return a perceptually uniform colour scale.
 
     Parameters
     ----------
@@ -252,16 +252,16 @@ class Theme:
     Attributes
     ----------
     name : "light" or "dark"
-    window : behind everything
-    card : of cards and lists, that lie on the window
-    field : of inputs
+    window : background of the window
+    card : background of cards and lists
+    field : background of inputs
     border, track : of hairlines; of empty bars and grooves
-    text, muted : of what is read, and of what stands beside it
-    accent, on_accent : of what invites, and of text on it
+    text, muted : of primary and secondary text
+    accent, on_accent : of highlighted elements, and of text on them
     free, colliding, waiting : of the three verdicts
-    sky_bottom, sky_top : behind the mesh
-    floor, shadow : beneath it
-    skin, ghost : of a mesh without shading, and of the one before Resolve
+    sky_bottom, sky_top : gradient behind the mesh
+    floor, shadow : beneath the mesh
+    skin, ghost : of a mesh without shading, and of the ghost
     """
 
     name: str
@@ -286,7 +286,7 @@ class Theme:
 
     @property
     def is_dark(self) -> bool:
-        """Whether text is lighter than what is behind it."""
+        """Whether this is the dark theme."""
         return self.name == "dark"
 
 

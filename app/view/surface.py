@@ -1,4 +1,4 @@
-"""A body's surface in the view: its mesh, a patch over it, its own textures."""
+"""A body's surface in the view: its mesh, a patch painted on it, its textures."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Surface:
-    """A triangle mesh; everything but its faces may change with every picture.
+    """A triangle mesh whose vertices, normals and colours may change with every picture.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class Surface:
 
     Attributes
     ----------
-    vertices, normals : (V, 3) float32 arrays that VTK reads and that are written in place
+    vertices, normals : (V, 3) float32 arrays that VTK reads; write to them in place
     colours : (V, C) uint8 array, likewise
     """
 
@@ -48,17 +48,17 @@ class Surface:
     def draw(self, faces: npt.NDArray[np.integer]) -> None:
         """Draw other (F, 3) faces of the same vertices from now on."""
         self.polydata.SetPolys(pv.CellArray.from_regular_cells(faces))
-        # Or else what picks would find the faces before.
+        # Otherwise a picker would find the previous faces.
         self.polydata.DeleteCells()
 
 
 def actor_of(polydata: pv.PolyData, coloured: bool = False, **look: Any) -> pv.Actor:
-    """Return what draws a mesh or lines, and is not picked.
+    """Return an actor that draws a mesh or lines and cannot be picked.
 
     Parameters
     ----------
-    coloured : by the mesh's active scalars, instead of one colour
-    look : see `pyvista.Property`
+    coloured : whether to colour by the mesh's active scalars, instead of one colour
+    look : properties of `pyvista.Property`
     """
     mapper = vtkPolyDataMapper()
     mapper.SetInputData(polydata)
@@ -69,16 +69,17 @@ def actor_of(polydata: pv.PolyData, coloured: bool = False, **look: Any) -> pv.A
 
 
 def body_actor(polydata: pv.PolyData, coloured: bool = True, **look: Any) -> pv.Actor:
-    """Return what draws a body: `actor_of` with a body's shine."""
+    """Return an actor for a body: `actor_of` with a body's lighting."""
     shine = {"ambient": 0.22, "diffuse": 0.92, "specular": 0.1, "specular_power": 18}
     return actor_of(polydata, coloured, **shine, **look)
 
 
 _ALONG = 0.85
-"""Factor on the length of a path along edges, which is longer than one across faces."""
+"""Factor on the length of a path along edges, to approximate the shorter one across faces."""
 
 _FAR, _BEYOND = 3.0, 1.5
-"""Radii from the middle of what is not painted, and as far as distances are measured."""
+"""Distances, in radii, assigned to points that are not painted, and up to which they are
+measured."""
 
 _FRAGMENT = """
   float straight = distance(patchVC.xyz, patchMiddle.xyz) / patchMiddle.w;
@@ -98,13 +99,13 @@ _FRAGMENT = """
   }
   //VTK::DepthPeeling::Impl
 """
-"""A fill that falls off as the weights do, and a rim, white within dark, of constant width."""
+"""A fill that falls off like the weights, and a rim, white inside dark, of constant width."""
 
 
 class Patch:
-    """Paints a grip on surfaces over whatever their colours say, smooth at any size of their faces.
+    """Paint the patch of a grip over the colours of surfaces, smooth at any face size.
 
-    Distances are those of the reference, in which grips are made.
+    Distances are those of the rest pose, in which grips are made.
 
     Parameters
     ----------
@@ -121,18 +122,18 @@ class Patch:
         self._grip: Grip | None = None
 
     def lie_on(self, polydata: pv.PolyData, vertices: npt.NDArray[np.intp] | None = None) -> None:
-        """Give a surface the distances that `paint_on` needs.
+        """Add the distances that `paint_on` needs to a surface.
 
         Parameters
         ----------
         polydata : the surface
-        vertices : (P,) array, the vertex of the body at each of its points; None for all in order
+        vertices : (P,) array, the body's vertex at each of its points; None for all in order
         """
         self._surfaces.append((polydata, vertices))
         polydata.point_data["patch"] = self._along_of(vertices)
 
     def paint_on(self, actor: pv.Actor) -> None:
-        """Paint on what draws a surface, or a part of one."""
+        """Paint on the actor of a surface, or of a part of one."""
         actor.mapper.MapDataArrayToVertexAttribute(
             "patchMC", "patch", vtkDataObject.FIELD_ASSOCIATION_POINTS, -1
         )
@@ -144,25 +145,25 @@ class Patch:
         ):
             place = f"//VTK::Normal::{block}"
             replace(place, True, f"{place}\n{text}", False)
-        # What follows lights and textures.
+        # Insert after lighting and textures.
         place = "//VTK::DepthPeeling::Impl"
         shading.AddFragmentShaderReplacement(place, True, _FRAGMENT, False)
         self._uniforms.append(shading.GetFragmentCustomUniforms())
         self._set_uniforms()
 
     def set_colour(self, colour: str) -> None:
-        """Fill with a colour, "#rrggbb", where the surface has none of its own."""
+        """Set the fill colour, "#rrggbb", used where the surface is not coloured."""
         self._look[:3] = (rgb(colour) / 255.0).tolist()
 
     def show(self, grip: Grip | None) -> bool:
-        """Paint a grip, or none; return whether that is another one than before."""
+        """Paint a grip, or none; return whether it differs from the previous one."""
         if grip is self._grip:
             return False
         self._grip = grip
         middle = [0.0, 0.0, 0.0, 0.0]
         if grip is not None:
             middle = [*self._along[grip.vertex, :3].tolist(), grip.radius]
-            # Somewhat beyond the rim, which lies between two vertices.
+            # Measure somewhat beyond the rim, which lies between two vertices.
             beyond = _BEYOND * grip.radius
             graph = self._space.surface_graph
             along = dijkstra(graph, directed=False, indices=grip.vertex, limit=beyond)
@@ -174,7 +175,7 @@ class Patch:
         return True
 
     def fit(self, sharpness: float) -> None:
-        """Draw the rim for a screen, given its device pixels per device-independent one."""
+        """Scale the rim to a screen's device pixel ratio."""
         self._look[3] = sharpness
         self._set_uniforms()
 
@@ -190,25 +191,25 @@ class Patch:
 
 _WRAPPED = {
     Wrap.REPEAT: "{at}",
-    # Not beyond the middle of the last pixel, which would blend into the first.
+    # Clamp to the middle of the last pixel, which would otherwise blend into the first.
     Wrap.MIRROR: "clamp(1.0 - abs(1.0 - mod({at}, 2.0)), {half}, 1.0 - {half})",
     Wrap.CLAMP: "clamp({at}, {half}, 1.0 - {half})",
 }
-"""In GLSL, as VTK wraps both directions of a texture in the same way."""
+"""GLSL expressions of the wrap modes: VTK wraps both directions of a texture in the same way."""
 
 
 class TexturedBody:
-    """Draws a mesh by its appearance: an actor for each material, all of them on the same points.
+    """Draw a mesh with its appearance: an actor for each material, on shared points.
 
     Parameters
     ----------
     appearance : of the mesh
     patch : to be painted on it
-    hidden : (F,) array, whether each of its faces is not drawn; None draws all
+    hidden : (F,) bool array, the faces that are not drawn; None draws all
 
     Attributes
     ----------
-    actors : to be added to a renderer, those that blend last
+    actors : to be added to a renderer, in this order: blended ones come last
     """
 
     def __init__(
@@ -244,12 +245,12 @@ class TexturedBody:
         self.actors += blended
 
     def follow(self, surface: Surface) -> None:
-        """Take the pose of the mesh."""
+        """Copy the pose of the mesh."""
         self._surface.vertices[:] = np.asarray(surface.vertices)[self._vertices]
         self._surface.normals[:] = np.asarray(surface.normals)[self._vertices]
 
     def set_visible(self, visible: bool) -> None:
-        """Show or hide it."""
+        """Show or hide all actors."""
         for actor in self.actors:
             actor.SetVisibility(visible)
 
@@ -259,8 +260,8 @@ def _actor_of(polydata: pv.PolyData, material: Material) -> pv.Actor:
     actor.prop.lighting = material.is_lit
     if not material.is_lit:
         actor.prop.ambient, actor.prop.diffuse = 0.0, 1.0
-    # Blended with what is drawn already, and hiding what is behind: hair of many layers, and skin
-    # that only says it blends, look right then without being sorted.
+    # Draw blended materials as opaque ones, with depth writes: layered hair, and skin marked as
+    # blended, then look right without sorting.
     actor.ForceOpaqueOn()
     seen = f"  if (fragOutput0.a < {max(material.cutoff, LEAST_SEEN * material.is_blended):.6f})"
     seen += " discard;\n"
@@ -284,7 +285,7 @@ def _actor_of(polydata: pv.PolyData, material: Material) -> pv.Actor:
 
 
 def _texture_of(texture: Texture) -> vtkTexture:
-    # VTK takes an image of one column for one row.
+    # VTK mistakes an image of one column for one row.
     pixels = np.repeat(texture.pixels, 2 if texture.pixels.shape[1] == 1 else 1, axis=1)
     height, width = pixels.shape[:2]
     image = pv.ImageData(dimensions=(width, height, 1))

@@ -1,8 +1,8 @@
-"""The look of the window: light and dark, its icons, its ring of progress.
+"""The look of the window: light and dark theme, icons and the busy ring.
 
-Fusion with an explicit palette looks alike everywhere, and can be dark where the desktop's own
-style cannot. What means "free" and "colliding" differs in hue for colour-blind readers too, and is
-never shown by colour alone.
+Fusion with an explicit palette looks the same everywhere, and can be dark even if the desktop's
+own style cannot. The colours for "free" and "colliding" differ in hue for colour-blind readers
+too, and are never the only sign.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ TIGHT, CLOSE, NORMAL, WIDE = 4, 8, 12, 16
 """The spacings of the window, in device-independent pixels."""
 
 ROW_HEIGHT = 26
-"""Of the row of a slider or a domain."""
+"""Height of the row of a slider or a domain, in device-independent pixels."""
 
 
 _DARKEST = 42.0
-"""CIELAB lightness of a bar that is seen in the dark theme's groove."""
+"""Least CIELAB lightness at which a bar is visible in the dark theme's groove."""
 
 _current = LIGHT
 
 
 def current_theme() -> Theme:
-    """Return the theme that was applied last."""
+    """Return the theme applied last."""
     return _current
 
 
@@ -53,8 +53,7 @@ def wanted_theme(choice: str) -> Theme:
 
     Parameters
     ----------
-    choice : "light", "dark", or "system" for what the desktop asks for; light if it has no
-        preference
+    choice : "light", "dark", or "system" for the desktop's preference; light if it has none
     """
     if choice == "system":
         is_dark = QGuiApplication.styleHints().colorScheme() is Qt.ColorScheme.Dark
@@ -66,14 +65,15 @@ def apply_theme(application: QApplication, theme: Theme) -> None:
     """Apply a theme to the whole application; widgets get a ``changeEvent``."""
     global _current
     _current = theme
-    # By name: a style made here, which Qt deletes, would leave its address to be taken for it.
+    # Set the style by name: Qt deletes a style object made here, and PySide would then mistake
+    # another object at its address for it.
     application.setStyle("Fusion")
     application.setPalette(_palette(theme))
     application.setStyleSheet(_style_sheet(theme))
 
 
 def _palette(theme: Theme) -> QPalette:
-    # Qt derives the colours that are not set here from these two.
+    # Qt derives colours that are not set below from these two.
     palette = QPalette(QColor(theme.card), QColor(theme.window))
     role, disabled = QPalette.ColorRole, QPalette.ColorGroup.Disabled
     for colour, roles in {
@@ -96,13 +96,13 @@ def _palette(theme: Theme) -> QPalette:
 
 
 def mixed(colour: str, other: str, fraction: float) -> QColor:
-    """Return a colour, mixed with a fraction of another one."""
+    """Return a colour mixed with a fraction of another."""
     one, two = rgb(colour).astype(float), rgb(other).astype(float)
     return QColor(*np.round(one + fraction * (two - one)).astype(int).tolist())
 
 
 def visible_colour(colour: str) -> QColor:
-    """Return a domain's colour, lightened where it would not be seen on the dark theme's bars."""
+    """Return a domain's colour, lightened in the dark theme if it would not be visible."""
     from lcollision_core.bodies.names import cielab
 
     shade = QColor(colour)
@@ -129,7 +129,7 @@ ICON_SIZE = 20
 """Side of an icon in tool bars, in device-independent pixels."""
 
 _SHARPNESSES = (1.0, 1.5, 2.0, 3.0)
-"""Device pixels per pixel that an icon is drawn for; Qt takes the nearest."""
+"""Device pixel ratios that an icon is drawn for; Qt uses the nearest."""
 
 
 def icon(name: str, colour: str | None = None) -> QIcon:
@@ -138,7 +138,7 @@ def icon(name: str, colour: str | None = None) -> QIcon:
     Parameters
     ----------
     name : of the file, without its extension
-    colour : "#rrggbb"; that of the text by default
+    colour : "#rrggbb"; the text colour by default
     """
     theme = current_theme()
     drawn = QIcon()
@@ -157,14 +157,14 @@ def give_icon(holder: QAction | QAbstractButton, name: str, ink: str = "text") -
     Parameters
     ----------
     name : of the file, without its extension
-    ink : which colour of the theme
+    ink : name of a colour of the theme
     """
     holder.setProperty("drawing", f"{name} {ink}")
     holder.setIcon(icon(name, getattr(current_theme(), ink)))
 
 
 def redraw_icons(root: QObject) -> None:
-    """Draw the icons of everything below an object in the theme that has come."""
+    """Redraw the icons of all descendants of an object in the current theme."""
     for holder in root.findChildren(QObject):
         drawing = holder.property("drawing")
         if isinstance(drawing, str) and isinstance(holder, QAction | QAbstractButton):
@@ -172,14 +172,14 @@ def redraw_icons(root: QObject) -> None:
 
 
 def pixmap(name: str, colour: str, size: int, sharpness: float = 1.0) -> QPixmap:
-    """Draw an icon at one size, unless it is known from before.
+    """Draw an icon at one size, or return it from the cache.
 
     Parameters
     ----------
     name : of the file, without its extension
     colour : "#rrggbb"
     size : side in device-independent pixels
-    sharpness : device pixels per pixel
+    sharpness : device pixel ratio
     """
     key = f"{name} {colour} {size} {sharpness}"
     canvas = QPixmap()
@@ -204,19 +204,19 @@ def program_icon() -> QIcon:
 
 
 _TURN_MILLISECONDS, _DEGREES_PER_STEP = 100, 33
-"""Each step composes the whole window anew, which without a graphics card takes both cores from
-what is waited for."""
+"""Each step recomposes the whole window; without a graphics card that takes processor time from
+the work in progress, so steps are few."""
 
 _ARC = 100
 _SIDE_PER_WIDTH = 11.0
 
 
 class Ring(QWidget):
-    """A ring that turns, and once it is stopped a sign of warning.
+    """A turning ring, or a warning sign while stopped.
 
     Parameters
     ----------
-    side : pixels
+    side : in device-independent pixels
     """
 
     def __init__(self, side: int) -> None:
@@ -228,11 +228,11 @@ class Ring(QWidget):
 
     @property
     def turns(self) -> bool:
-        """Whether it turns."""
+        """Whether the ring is turning."""
         return self._timer.isActive()
 
     def start(self) -> None:
-        """Turn until it is stopped."""
+        """Start turning."""
         self._timer.start()
 
     def stop(self) -> None:

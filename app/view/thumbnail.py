@@ -1,7 +1,7 @@
-"""Pictures of meshes of a few pixels.
+"""Small pictures of meshes, drawn without OpenGL.
 
-A second OpenGL context beside the viewport's would switch contexts at every one of them, which
-software drivers do not survive.
+A second OpenGL context beside the viewport's would switch contexts for each picture, which crashes
+software drivers.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from app.view.camera import VIEW_ANGLE, View
 from app.view.theme import current_theme
 
 _SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
-"""By whether the theme is dark."""
+"""Colour of the mesh, by whether the theme is dark."""
 
 _FINENESS = 2
-"""Dots per pixel and axis, averaged afterwards: smooth edges."""
+"""Dots per pixel along each axis, averaged to smooth the edges."""
 
 _MOST_CUTS = 10
 _AMBIENT = 0.42
@@ -33,13 +33,13 @@ def draw_pose(
     side: int,
     colour: tuple[int, int, int],
 ) -> npt.NDArray[np.uint8]:
-    """Draw a mesh by dots, the nearest last.
+    """Draw a mesh as dots, the nearest last.
 
     Parameters
     ----------
     vertices : (V, 3) array, in the data's unit
     faces : (F, 3) array
-    view : from where; the perspective is left out
+    view : camera, used without perspective
     side : of the picture, in pixels
     colour : red, green and blue of the lit mesh, from 0 to 255
 
@@ -47,7 +47,7 @@ def draw_pose(
     -------
     pixels : (side, side, 4) uint8 array, red, green, blue and alpha, which is 0 beside the mesh
     """
-    # Loads the compiler: not before the window is on the screen.
+    # Import late: it loads the compiler, which must wait until the window is on the screen.
     from lcollision_core.meshes.normals import vertex_normals
 
     arm = view.position - view.focus
@@ -72,7 +72,7 @@ def draw_pose(
     columns = np.floor(0.5 * n_dots + dots[order, 0]).astype(np.intp)
     rows = np.floor(0.5 * n_dots - dots[order, 1]).astype(np.intp)
     inside = (columns >= 0) & (columns < n_dots) & (rows >= 0) & (rows < n_dots)
-    # Where several dots fall on one place, the last one written, the nearest, stays.
+    # If several dots fall on one pixel, the last one written, the nearest, stays.
     picture = np.zeros((n_dots, n_dots, 4))
     strength = (_AMBIENT + (1.0 - _AMBIENT) * shade[order])[inside, None]
     picture[rows[inside], columns[inside], :3] = strength * np.array(colour)
@@ -91,7 +91,7 @@ def picture_of(
     side: int,
     sharpness: float,
 ) -> QPixmap:
-    """Draw a mesh in the theme's skin, `side` device-independent pixels wide; see `draw_pose`."""
+    """Draw a mesh in the theme's skin colour, in device-independent pixels; see `draw_pose`."""
     n_pixels = round(side * sharpness)
     pixels = draw_pose(vertices, faces, view, n_pixels, _SKIN[current_theme().is_dark])
     image = QImage(pixels.data, n_pixels, n_pixels, QImage.Format.Format_RGBA8888)
@@ -100,6 +100,6 @@ def picture_of(
 
 
 def _barycentric(cuts: int) -> npt.NDArray[np.float64]:
-    """Return the weights of a triangle's corners at evenly spread places, (W, 3)."""
+    """Return barycentric coordinates of evenly spaced points of a triangle, (W, 3)."""
     counts = [(i, j, cuts - i - j) for i in range(cuts + 1) for j in range(cuts + 1 - i)]
     return np.array(counts) / cuts

@@ -1,4 +1,4 @@
-"""The viewport: canvas, scene, legend, and the cover while something is opened."""
+"""The viewport: canvas, scene, legend, and the waiting page before the first model."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _RING_SIDE = 38
 
 
 class WaitingPage(QWidget):
-    """Says what is loading beside a turning ring, or shows why loading failed.
+    """Show what is loading below a turning ring, or why loading failed.
 
     Signals
     -------
@@ -45,7 +45,7 @@ class WaitingPage(QWidget):
 
     Parameters
     ----------
-    document : followed until its first model is in
+    document : followed until its first model is open
     parent : of the widget
     """
 
@@ -78,7 +78,7 @@ class WaitingPage(QWidget):
 
     @property
     def text(self) -> str:
-        """What is loading and why it takes long, or the error."""
+        """The text shown: what is loading and why it takes long, or the error."""
         return self._words.text()
 
     @property
@@ -88,14 +88,14 @@ class WaitingPage(QWidget):
 
     @Slot(str)
     def set_text(self, text: str) -> None:
-        """Say what is loading; "" changes nothing."""
+        """Show what is loading; "" changes nothing."""
         if text and not self._stopped:
             self._what = text
             self._wait()
 
     @Slot(str)
     def explain(self, reason: str) -> None:
-        """Say why loading takes long."""
+        """Show why loading takes long."""
         self._reason = reason
         if self.turns:
             self._wait()
@@ -120,27 +120,27 @@ class WaitingPage(QWidget):
 
 
 _GROWTH = 1.15
-"""Margin round the first pose, so that other poses stay in view."""
+"""Scale of the first pose's extent for framing, so that other poses stay in view."""
 
 _TRANSITION_MILLISECONDS = 320
-"""Milliseconds from the pose before Resolve to the one after."""
+"""Duration of the transition to the pose that Resolve found."""
 
 _TURN_MILLISECONDS = 260
-"""Milliseconds from one camera to another."""
+"""Duration of the transition from one camera view to another."""
 
 Float32Array = npt.NDArray[np.float32]
 
 _HELPED = ", the whole body helps"
 
 _CLOSE_UP = 0.12
-"""Of the body size: half the side of the box that a place is looked at with."""
+"""Half the side of the box framed by a close-up, as a fraction of the body size."""
 
 
 class Viewport(QWidget):
-    """Draws the newest frame of a document, each once.
+    """The 3D view of a document, which draws its newest frame.
 
-    Cheap to construct: VTK is imported when the first model is in; until then the page
-    `waiting` explains the wait. Call `shut_down` before the window closes.
+    It is cheap to construct: a thread imports VTK, and until the first model is open the page
+    `waiting` is shown. Call `shut_down` before the window closes.
 
     Parameters
     ----------
@@ -149,25 +149,25 @@ class Viewport(QWidget):
 
     Attributes
     ----------
-    shading : what the colours say; see `set_shading`
+    shading : meaning of the colours; see `set_shading`
     shown_frame : the frame that the last picture shows, or is animated towards
     follows : whether the camera moves along with the body from frame to frame of a motion
-    canvas : the widget that draws and takes the mouse; None before the first model is in
-    mouse : what it does to the body and to the camera; likewise
-    scene : what stands before the camera; likewise
+    canvas : widget that draws and gets the mouse events; None before the first model is open
+    mouse : interaction with the body and the camera; likewise
+    scene : the scene drawn; likewise
     hovered_domain : the domain under the pointer, or None
-    pictures : makes screenshots and turntable videos
-    waiting : the page before the first model is in
+    pictures : makes screenshots and videos
+    waiting : the page shown before the first model is open
 
     Signals
     -------
     domain_hovered : int, the domain under the pointer, or None
     shading_changed : Shading
-    pointed : `pointed_vertex` may be another
-    menu_wanted : int or None, the domain that was clicked with the right button, int or None, the
-        vertex, and QPoint, where on the screen
-    painted : float, the seconds that drawing one picture took; see `Canvas.painted`
-    hinted : str, what can be done while the body is dragged; "" as the drag ends
+    pointed : `pointed_vertex` may have changed
+    menu_wanted : int or None, int or None and QPoint: the right-clicked domain and vertex, and the
+        position on the screen
+    painted : float, the seconds that one picture took; see `Canvas.painted`
+    hinted : str, hint for the current drag; "" as it ends
     """
 
     domain_hovered = Signal(object)
@@ -201,15 +201,15 @@ class Viewport(QWidget):
         self.waiting = WaitingPage(document, self)
         self._layout.addWidget(self.waiting)
         self._legend = LegendStrip(self)
-        # Beneath the mesh, not over it, however close one looks.
+        # Put the legend below the canvas, so that it never covers the mesh.
         column = QVBoxLayout(self)
         column.setContentsMargins(0, 0, 0, 0)
         column.setSpacing(0)
         column.addLayout(self._layout, 1)
         column.addWidget(self._legend)
         self._tag = DomainTag(self)
-        # A window that gets its first OpenGL widget when it is already shown is made anew, and
-        # flickers.
+        # Qt recreates a window, which flickers, if its first OpenGL widget is added after it is
+        # shown.
         self._first_gl_widget = QOpenGLWidget(self)
         self._first_gl_widget.resize(1, 1)
         self._first_gl_widget.lower()
@@ -235,19 +235,19 @@ class Viewport(QWidget):
         document.timeline.opened.connect(self._set_ground)
         document.history.pose_loaded.connect(self._on_pose_loaded)
         if document.has_model:
-            # After the window is on the screen.
+            # Wait until the window is on the screen.
             QTimer.singleShot(0, self, self._on_model_changed)
 
-    # What is shown.
+    # Public operations.
 
     @property
     def legend(self) -> Legend:
-        """What explains the colours now."""
+        """The current legend of the colours."""
         return self._legend.legend
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether what is on the screen is the newest pose, smooth, and nothing moves."""
+        """Whether the newest pose is drawn, anti-aliased, and nothing moves."""
         return (
             self.canvas is not None
             and self.shown_frame is not None
@@ -269,14 +269,14 @@ class Viewport(QWidget):
         return self.mouse is not None and self.mouse.arrows is not None
 
     def follow_menu(self, menu: QMenu) -> None:
-        """Keep the last patch while a menu is open that the pointer leaves the body for."""
+        """Keep the last patch while a menu is open, although the pointer leaves the body."""
 
         def on_open() -> None:
             if self.mouse is not None:
                 self.mouse.keep_patch()
 
         def on_close() -> None:
-            # Soon, which is after the menu has done what was chosen.
+            # The delay lets the menu run the chosen command first.
             if self.mouse is not None:
                 self.mouse.look_again()
 
@@ -284,17 +284,17 @@ class Viewport(QWidget):
         menu.aboutToHide.connect(on_close)
 
     def toggle_pin(self, oriented: bool = False) -> None:
-        """Pin the patch under the pointer, maybe with its orientation, or take its pin away."""
+        """Pin the patch under the pointer, optionally with its orientation, or unpin it."""
         if self.mouse is not None:
             self.mouse.toggle_pin(oriented)
 
     def toggle_arrows(self) -> None:
-        """Draw arrows to drag on the patch under the pointer, or take them away."""
+        """Show or hide arrows to drag on the patch under the pointer."""
         if self.mouse is not None:
             self.mouse.toggle_arrows()
 
     def set_shading(self, shading: Shading) -> None:
-        """Choose what the colours say."""
+        """Choose what the colours show."""
         if shading is self.shading:
             return
         self.shading = shading
@@ -315,7 +315,7 @@ class Viewport(QWidget):
                 self.canvas.redraw()
 
     def hide_faces(self, hidden: npt.NDArray[np.bool_] | None) -> None:
-        """Draw all faces but some: (F,) bool array, None for none; until another model is in."""
+        """Hide faces, a (F,) bool array or None, until another model is opened."""
         if self.scene is not None:
             self.scene.hide_faces(hidden)
             self._recolour(crossing=True)
@@ -323,13 +323,13 @@ class Viewport(QWidget):
     # The camera.
 
     def point_out(self, faces: npt.NDArray[np.integer] | None) -> None:
-        """Tint faces, given by number, that a list names; None for none."""
+        """Tint the faces with these indices; None for none."""
         if self.scene is not None:
             self.scene.named.show(faces)
             self._redraw()
 
     def set_camera(self, name: str, animated: bool = True) -> None:
-        """Look at the whole pose from a side.
+        """Look at the whole pose from a preset side.
 
         Parameters
         ----------
@@ -338,7 +338,7 @@ class Viewport(QWidget):
 
         Raises
         ------
-        KeyError : `name` is no preset.
+        KeyError : `name` is not a preset.
         """
         if self.canvas is None or self.scene is None or self.shown_frame is None:
             return
@@ -351,11 +351,11 @@ class Viewport(QWidget):
         self._turn.begin(partial(between, self.scene.view, end))
 
     def look_at(self, places: npt.NDArray[np.floating]) -> None:
-        """Look at two places next to each other, along the gap between them.
+        """Look closely at two points, from a direction in which the gap between them shows.
 
         Parameters
         ----------
-        places : (2, 3) array, in the data's unit, in the reference's frame
+        places : (2, 3) array, in the data's unit and the model's coordinates
         """
         if self.scene is None or self.shown_frame is None:
             return
@@ -382,11 +382,16 @@ class Viewport(QWidget):
 
     @Slot()
     def frame_pose(self) -> None:
-        """Frame the document's pose like a model's first, as soon as it is drawn."""
+        """Frame the document's pose like a model's first pose, once it is drawn."""
         self._framed = self._document.history.latent
 
     def scene_now(self) -> Scene:
-        """Return the scene, brought up to date for the next picture."""
+        """Return the scene, updated for the next picture.
+
+        Raises
+        ------
+        LCollisionError : no pose is on the screen yet.
+        """
         if self.scene is None or self.shown_frame is None:
             raise LCollisionError("the mesh is not on the screen yet", "try again in a moment")
         self._bring_up_to_date()
@@ -405,10 +410,10 @@ class Viewport(QWidget):
             self.canvas.deleteLater()
         self.canvas = self.scene = None
 
-    # Qt's.
+    # Overridden from Qt.
 
     def sizeHint(self) -> QSize:  # noqa: N802 - Qt's name
-        """Return a size that shows a body well."""
+        """Ask for a size that shows a body well."""
         return QSize(720, 720)
 
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
@@ -424,7 +429,7 @@ class Viewport(QWidget):
         self.shut_down()
         super().closeEvent(event)
 
-    # The document's.
+    # Following the document.
 
     @Slot()
     def _on_model_changed(self) -> None:
@@ -447,7 +452,7 @@ class Viewport(QWidget):
             self.mouse.redraw_wanted.connect(self._redraw)
         view = None
         if self.scene is not None:
-            # The same body with other names or colours is looked at as before.
+            # Keep the camera if only names or colours of the same body have changed.
             is_same = self._model is not None and self._model.topology is model.topology
             view = self.scene.view if is_same else None
         self.scene = Scene(self.canvas, model, current_theme())
@@ -457,7 +462,7 @@ class Viewport(QWidget):
         self.shown_frame = None
         self._highlight = None
         assert self.mouse is not None
-        # Vertices of the model before are none of this one.
+        # Vertices of the previous model are not valid in this one.
         self.mouse.let_go()
         self._place_camera = view is None
         if view is not None:
@@ -495,9 +500,9 @@ class Viewport(QWidget):
 
     @Slot()
     def _set_ground(self) -> None:
-        """Keep the floor at the feet of the rest pose, or of a motion.
+        """Put the floor at the lowest point of the rest pose, or of the motion so far.
 
-        Poses of a learned model have no place of their own; the floor lies beneath them.
+        Poses of a learned model have no position of their own; the floor follows them.
         """
         if self.canvas is not None and self.scene is not None:
             model = self._document.model
@@ -540,9 +545,9 @@ class Viewport(QWidget):
             self.canvas.redraw()
 
     def _bring_up_to_date(self) -> None:
-        """Write the newest pose and its colours, just before they are drawn.
+        """Write the newest pose and its colours to the scene, just before a picture.
 
-        However many frames come between two pictures, only the last is written.
+        Of several frames between two pictures, only the last is written.
         """
         frame, scene = self._document.motion.frame, self.scene
         if scene is None or frame is None:
@@ -559,7 +564,7 @@ class Viewport(QWidget):
             self._crossing_stale = False
             exact = self._document.motion.exact if self.shading is Shading.EXACT else None
             scene.crossing.show(None if exact is None else exact.pairs)
-            # While the pose is dragged, those of the pose before stay.
+            # In a drag, excluded pairs are only counted: keep those of the previous check.
             if exact is None or not exact.counted_only:
                 scene.uncounted.show(None if exact is None else exact.excluded_pairs)
         if self.mouse is not None:
@@ -632,7 +637,7 @@ class Viewport(QWidget):
         )
 
     def _explain_colours(self) -> None:
-        """Bring the legend up to date; never before a picture, see `Canvas`."""
+        """Update the legend; not to be called in `before_paint`, see `Canvas`."""
         frame = self._document.motion.frame
         if self._shader is None or frame is None:
             return
@@ -656,7 +661,7 @@ class Viewport(QWidget):
         seen = self if self.canvas is None else self.canvas
         return seen.width() / max(1, seen.height())
 
-    # Motion.
+    # Animation.
 
     @Slot(object)
     def _on_pose_moved(self, vertices: Float32Array) -> None:
@@ -707,7 +712,7 @@ class Viewport(QWidget):
 
     @Slot(object)
     def _show_tag(self, position: QPointF | None) -> int | None:
-        """Name the domain under the pointer, which is returned, and whether the body helps it."""
+        """Show the name of the domain under the pointer in the tag, and return the domain."""
         domain = self._domain_of(self.mouse.vertex) if self.mouse is not None else None
         if domain is None or position is None or self.mouse is None:
             self._tag.hide()
@@ -721,6 +726,6 @@ class Viewport(QWidget):
 
 
 def _between_poses(start: Float32Array, end: Float32Array, fraction: float) -> Float32Array:
-    """Return (V, 3) vertices on the lines between two poses; at the end that very array."""
+    """Interpolate (V, 3) vertices linearly between two poses; at the end return `end` itself."""
     moved: Float32Array = start + np.float32(fraction) * (end - start)
     return end if fraction >= 1.0 else moved
