@@ -1,4 +1,4 @@
-"""Exact labels of samples of the latent box, and the folder that keeps them."""
+"""Exact labels of samples of the latent box, and the folder that stores them."""
 
 from lcollision_core.labels.labeller import (
     Labeller,

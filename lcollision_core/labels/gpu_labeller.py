@@ -1,4 +1,4 @@
-"""Latent codes to exact labels on a GPU; only the labels leave it."""
+"""Label latent codes exactly on a GPU; only the labels leave it."""
 # mypy: disable-error-code="no-untyped-def, untyped-decorator"
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from lcollision_core.on_gpu import GPU_LOCK, THREADS, Buffers, blocks_for, cuda
 
 @cuda.jit
 def sum_energies(vertex_energy, shares, sums):
-    """Write (B, K) sums of (B, V) energies by (V, K) shares, each in the order of the vertices."""
+    """Write (B, K) sums of (B, V) energies weighted by (V, K) shares, each in vertex order."""
     first, n_domains = cuda.grid(1), shares.shape[1]
     for cell in range(first, sums.shape[0] * n_domains, cuda.gridsize(1)):
         row, domain = cell // n_domains, cell % n_domains
@@ -26,13 +26,13 @@ def sum_energies(vertex_energy, shares, sums):
 
 
 class GpuLabeller:
-    """Labels codes of one model.
+    """Label codes of one model on a GPU.
 
     Parameters
     ----------
-    embedding, body_size : as of `Labeller`
+    embedding, body_size : as for `Labeller`
     detector : the exact check
-    shares : (K, V) of each domain in the vertices
+    shares : (K, V) share of each domain in the vertices
     """
 
     def __init__(
@@ -54,9 +54,9 @@ class GpuLabeller:
 
         Returns
         -------
-        n_pairs : (B,) colliding pairs
-        energy : (B, K + 1), of the domains and of all, in normalised length squared
-        left : numbers of poses that are left to the processor
+        n_pairs : (B,) number of colliding pairs
+        energy : (B, K + 1), of the domains and in total, in normalised length squared
+        left : indices of poses that are left to the CPU
         """
         n_pairs = np.zeros(len(codes), dtype=np.int32)
         energy = np.zeros((len(codes), self._shares.shape[1]))

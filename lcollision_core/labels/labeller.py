@@ -1,4 +1,4 @@
-"""Label latent codes by the exact check, and the identity of what was labelled."""
+"""Label latent codes by the exact check, and identify the labelled data."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from lcollision_core.labels.gpu_labeller import GpuLabeller
 
 BOX_ROWS = 16
-"""First rows of a mixed block: samples of the box."""
+"""Number of rows of a mixed block, the first ones, that are samples of the box."""
 
 
 def measures(index: npt.ArrayLike, draws: Draws = Draws.BOX) -> npt.NDArray[np.bool_]:
-    """Return which samples measure a predictor: those of the box that `is_held_out` holds out.
+    """Return which samples measure a predictor: the held-out samples of the box.
 
     Parameters
     ----------
     index : (B,) integer array, the samples' indices in the store
-    draws : what they are drawn from
+    draws : how they are drawn
     """
     return is_held_out(index) & is_of_box(index, draws)
 
@@ -44,10 +44,10 @@ def is_of_box(index: npt.ArrayLike, draws: Draws) -> npt.NDArray[np.bool_]:
 
 
 def is_held_out(index: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-    """Return which samples test a predictor and never train it: those whose index ends in 7, 8, 9.
+    """Return which samples only test a predictor: those whose index ends in 7, 8 or 9.
 
-    A fixed 30 %, so that a row keeps its side when its store grows. Samples are independent, so
-    any fixed choice is as random as another.
+    The 30 % are fixed, so that a row stays held out when its store grows. Samples are independent,
+    so any fixed choice is as random as another.
 
     Parameters
     ----------
@@ -59,14 +59,15 @@ def is_held_out(index: npt.ArrayLike) -> npt.NDArray[np.bool_]:
 
 _NOISY_BLENDS, _MIXED_PARTS = 4, 4
 _BISECTIONS, _KEPT_BISECTIONS, _SEGMENTS = 7, 4, 2
-"""Of the segments between a free and a colliding row; together as many rows as a block lacks."""
+"""Bisections of each segment between a free and a colliding row, those kept, and the number of
+segments; the kept ones fill up a block."""
 
 MIXED_COST = 1.0 + _SEGMENTS * (_BISECTIONS - _KEPT_BISECTIONS) / ROWS_PER_BLOCK
-"""Poses that are decoded and checked for each mixed sample."""
+"""Poses that are decoded and checked per mixed sample."""
 
 
 def blocks_of(rows: range, size: int = ROWS_PER_BLOCK) -> Iterator[range]:
-    """Split rows, from a multiple of `ROWS_PER_BLOCK` on, into blocks, one task each."""
+    """Split rows that start at a multiple of `ROWS_PER_BLOCK` into blocks, one per task."""
     for first in range(rows.start, rows.stop, size):
         yield range(first, min(first + size, rows.stop))
 
@@ -80,7 +81,7 @@ class LabelRows:
     latent : (B, D) float32 array, Z_all
     domain_energy : (B, K) float64 array, S_k, sums to `energy`, in normalised length squared
     energy : (B,) float64 array, PDe-sum, in normalised length squared
-    n_pairs : (B,) int32 array, colliding pairs of faces
+    n_pairs : (B,) int32 array, number of colliding pairs of faces
     """
 
     latent: npt.NDArray[np.float32]
@@ -93,16 +94,16 @@ class LabelRows:
 
     @property
     def colliding(self) -> npt.NDArray[np.bool_]:
-        """(B,) whether each pose intersects itself, by the strict pair rule."""
+        """(B,) whether each pose intersects itself."""
         return self.n_pairs > 0
 
     def taken(self, index: npt.NDArray[Any] | slice) -> LabelRows:
-        """Return the rows chosen by an index, a boolean array or, as views, by a slice."""
+        """Return the rows of an index, a boolean array or, as views, of a slice."""
         return LabelRows(*(getattr(self, field.name)[index] for field in fields(self)))
 
     @classmethod
     def joined(cls, parts: Sequence[LabelRows]) -> LabelRows:
-        """Concatenate rows, in one copy."""
+        """Concatenate rows with a single copy."""
         return cls(
             *(
                 np.concatenate([getattr(part, field.name) for part in parts])
@@ -112,24 +113,24 @@ class LabelRows:
 
 
 _Asking = Generator[npt.NDArray[np.float32], LabelRows, LabelRows]
-"""What asks for labels of codes, and returns rows in the end."""
+"""A generator that yields codes, is sent their labels, and finally returns rows."""
 
 
 @dataclass(frozen=True, eq=False)
 class Labeller:
-    """Decodes latent poses and finds their exact labels; may be shared between threads.
+    """Decode latent poses and find their exact labels; may be shared between threads.
 
     Vertices are tested as `LearnedBody` exports them: in the data's unit, rounded to float32. So a
     label agrees with every other exact check of the same pose.
 
     Attributes
     ----------
-    embedding : decodes
+    embedding : decodes the poses
     body_size : in the data's unit
     rules : which pairs of faces do not count
-    groups : named groups of faces, of which the rules may ignore pairs
+    groups : groups of faces that the rules may name
     fingerprint : identifies the model
-    draws : what the samples are drawn from
+    draws : how samples are drawn
     """
 
     embedding: Embedding
@@ -160,20 +161,20 @@ class Labeller:
         return GpuLabeller(self.embedding, self.body_size, self.detector, self._shares)
 
     def prepare(self) -> None:
-        """Build the lazy parts once, before several threads would."""
+        """Build the lazy parts once, before threads use them."""
         _ = self.detector, self._shares, self.embedding.codec, self.embedding.decoder
 
     def label_rows(self, seed: int, rows: range) -> LabelRows:
-        """Draw samples of the box and label them, on the calling thread alone.
+        """Draw samples and label them, on the calling thread.
 
         Parameters
         ----------
         seed : of the samples
-        rows : their indices, at least one, from a multiple of `ROWS_PER_BLOCK` on
+        rows : their indices, at least one, starting at a multiple of `ROWS_PER_BLOCK`
         """
         done, waiting = {}, {block: self._label_block(seed, block) for block in blocks_of(rows)}
         asked = {block: next(labelled) for block, labelled in waiting.items()}
-        # Blocks ask in step, as a GPU labels many poses in the time of a few.
+        # Label the requests of all blocks together: a GPU labels many poses in the time of a few.
         while asked:
             labels = self.label(np.concatenate(list(asked.values())))
             stops = np.cumsum([len(codes) for codes in asked.values()])
@@ -187,10 +188,10 @@ class Labeller:
         return LabelRows.joined([done[block] for block in waiting])
 
     def _label_block(self, seed: int, rows: range) -> _Asking:
-        """Draw a block and ask for labels: of the box alone or, mixed, half of it.
+        """Draw a block and yield codes to label: samples of the box or, if mixed, half of these.
 
-        A quarter of a mixed block are blends with noise and mixed parts, and a quarter lies near
-        the border of the free set: bisections of segments from a free to a colliding row.
+        A quarter of a mixed block consists of blends with noise and mixed parts, and a quarter lies
+        near the border of the free set: bisections of segments from a free to a colliding row.
         """
         number = rows.start // ROWS_PER_BLOCK
         box = self.embedding.box.draw(seed, number)
@@ -204,7 +205,7 @@ class Labeller:
                 draws.mixed_parts(_MIXED_PARTS, numbers),
             ]
         )
-        # Held-out samples of the box measure; no training row lies on a segment that ends there.
+        # Held-out samples of the box measure: keep training rows off segments that end there.
         ends = drawn.taken(~measures(np.arange(rows.start, rows.start + len(drawn)), self.draws))
         near = yield from self._near_border(ends, box[len(drawn) :])
         return LabelRows.joined([drawn, near]).taken(slice(len(rows)))
@@ -226,7 +227,7 @@ class Labeller:
         return LabelRows.joined(kept[-_KEPT_BISECTIONS:])
 
     def label(self, latent: npt.NDArray[Any]) -> LabelRows:
-        """Label latent poses exactly, on the calling thread alone.
+        """Label latent poses exactly, on the calling thread.
 
         Parameters
         ----------
@@ -234,8 +235,8 @@ class Labeller:
 
         Returns
         -------
-        rows : LabelRows; a pose gets the same bits in whichever batch it comes. On a GPU, it may
-            be others than on the processor: energies agree to rounding.
+        rows : LabelRows; the batch does not change the bits of a pose, but a GPU may: its energies
+            agree with the CPU's up to rounding
 
         Raises
         ------
@@ -269,15 +270,15 @@ class Labeller:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        # The detector lends out per-thread work arrays and does not travel; the embedding travels
-        # with its factored matrix, which another machine might factor to other bits.
+        # The detector holds work arrays of threads and is not pickled; the embedding is pickled
+        # with its factored matrix, as another machine might factor it to other bits.
         self.prepare()
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 @compiled_part
 def _pairwise_sum(terms: npt.NDArray[np.float64]) -> float:
-    """Sum numbers to the bit as NumPy does: in eight lanes, and long ones by halves."""
+    """Sum numbers with the same bits as NumPy: in eight lanes, long arrays by halves."""
     n = len(terms)
     if n < 8:
         total = 0.0
@@ -308,13 +309,13 @@ def _sum_energies(
 ) -> None:
     """Fill in (B, K) energies of domains and (B,) energies of poses.
 
-    Not by a matrix product: BLAS sums in an order that depends on the processor, its threads and
-    the batch, and rows must be the same on every machine.
+    A matrix product would not do: BLAS sums in an order that depends on the CPU, its threads and
+    the batch, but rows must be the same on every machine.
 
     Parameters
     ----------
     vertex_energy : (B, V)
-    shares : (K, V) of each domain in the vertices
+    shares : (K, V) share of each domain in the vertices
     """
     touched = np.empty(vertex_energy.shape[1], dtype=np.int64)
     terms = np.empty(vertex_energy.shape[1])
@@ -333,19 +334,19 @@ def _sum_energies(
 
 @dataclass(frozen=True)
 class StoreIdentity:
-    """What a store labels; rows of two stores with one identity are interchangeable.
+    """The identity of a store's labels; stores with equal identities have interchangeable rows.
 
     Attributes
     ----------
     model : fingerprint of the model
     seed : of the samples
     n_domains : K
-    height : the body size, in the data's unit, whose float32 values the vertices are rounded to
+    height : the body size, in the data's unit, in which vertices are rounded to float32
     near_exclusion : normalised
     box_low, box_high : D numbers each
     rules : which pairs of faces do not count; older stores have the near exclusion only
-    ignored_faces : digest of the groups that the rules ignore pairs of, empty if none
-    draws : what the samples are drawn from; older stores have samples of the box
+    ignored_faces : digest of the groups in ignored pairs, empty if there are none
+    draws : how samples are drawn; older stores have samples of the box
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Run a labelling over cores or machines, shard by shard, with resuming.
 
-Threads and not processes: decoding and the exact check run outside the interpreter's lock, they
-share one model and start at once.
+Threads replace processes: decoding and the exact check release the GIL, and threads share one model
+and start at once.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CountRows = Callable[[LabelRows], None]
 """Called with the rows that were labelled since the last call."""
 
 _BLOCKS_AHEAD = 2
-"""Blocks submitted for each thread, so that none idles while a chunk is written."""
+"""Blocks submitted per thread, so that none idles while a chunk is written."""
 
 
 def label_locally(
@@ -41,7 +41,7 @@ def label_locally(
     count: CountRows,
     job: Job,
 ) -> Generator[tuple[range, LabelRows], None, None]:
-    """Label chunks one after the other, their blocks spread over threads.
+    """Label chunks in turn, with their blocks spread over threads.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def label_locally(
 
     Yields
     ------
-    each of `chunks` with its labels, in their order
+    each of `chunks` with its labels, in order
 
     Raises
     ------
@@ -83,12 +83,12 @@ def label_locally(
 _CONNECT_SECONDS = 20
 _POLL_SECONDS = 0.5
 _CHUNKS_AHEAD = 2
-"""Chunks submitted for each thread of the cluster, so that none idles while its result travels."""
+"""Chunks submitted per thread of the cluster, so that none idles while its result travels."""
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 FromWorker = tuple[str, str, _Result]
-"""The worker, its version of this program, and what it found."""
+"""The worker's address, its version of this program, and the result."""
 
 
 def label_on_cluster(
@@ -112,11 +112,11 @@ def label_on_cluster(
 
     Yields
     ------
-    each of `chunks` with its labels, as they come
+    each of `chunks` with its labels, in order of completion
 
     Raises
     ------
-    LCollisionError : as of `run_on_cluster`.
+    LCollisionError : as for `run_on_cluster`.
     CancelledError : the job was cancelled.
     """
     items = [(seed, rows) for rows in chunks]
@@ -132,28 +132,28 @@ def run_on_cluster(
     scheduler: str,
     job: Job,
 ) -> Generator[tuple[_Item, _Result], None, None]:
-    """Run something for each of some items on the workers of a Dask scheduler.
+    """Run a function on each item on the workers of a Dask scheduler.
 
-    The workers need this program in the same version. Those that leave are replaced by others,
-    those that come later join in; every result carries the version that it is from.
+    The workers need this program in the same version. Items of workers that leave are run by
+    others, and late workers join in; every result carries the version of its worker.
 
     Parameters
     ----------
-    run : called with `shared` and an item on a worker, and returns `from_worker` of what it finds
-    shared : is sent to every worker once
-    items : what to do
+    run : called on a worker with `shared` and an item; returns `from_worker` of its result
+    shared : sent to every worker once
+    items : arguments of `run`
     scheduler : its address
     job : polled while waiting
 
     Yields
     ------
-    each of `items` with its result, as they come
+    each of `items` with its result, in order of completion
 
     Raises
     ------
     MissingExtraError : Dask is not installed.
-    LCollisionError : no scheduler or worker answers, a worker has another version of the program
-        or none, or workers die.
+    LCollisionError : no scheduler or worker answers, a worker lacks the program or has another
+        version, or workers die.
     CancelledError : the job was cancelled.
     """
     try:
@@ -169,7 +169,7 @@ def run_on_cluster(
         try:
             client = connect()
         except AssertionError:
-            # On a machine that stalls Dask gives its own thread up; a second one starts afresh.
+            # On a machine that stalls, Dask gives up its own thread; a second attempt works.
             client = connect()
     except (OSError, ValueError, TypeError) as error:
         raise LCollisionError(
@@ -185,7 +185,7 @@ def run_on_cluster(
             remaining = deque(items)
             pending: dict[Any, _Item] = {}
             while remaining or pending:
-                # Workers come and go; with none, an item waits for the next.
+                # Workers come and go; without any, an item waits for the next.
                 n_threads = max(sum(client.nthreads().values()), 1)
                 while remaining and len(pending) < _CHUNKS_AHEAD * n_threads:
                     item = remaining.popleft()
@@ -196,7 +196,7 @@ def run_on_cluster(
                 for future in [future for future in pending if future.done()]:
                     item = pending.pop(future)
                     worker, version, result = future.result()
-                    # For every item: workers that join late are not checked before.
+                    # Check every item: workers that join late were not checked before.
                     _require_version(worker, version)
                     yield item, result
         except TimeoutError as error:
@@ -217,17 +217,17 @@ def run_on_cluster(
 
 
 def program_version() -> str:
-    """Return the version of this program, which the workers' must equal."""
+    """Return the version of this program, which workers must have too."""
     return version("lcollision")
 
 
 def label_on_worker(labeller: Labeller, chunk: tuple[int, range]) -> FromWorker[LabelRows]:
-    """Label one chunk, of a seed and rows."""
+    """Label one chunk, given as (seed, rows)."""
     return from_worker(labeller.label_rows(*chunk))
 
 
 def from_worker(result: _Result) -> FromWorker[_Result]:
-    """Say which worker found a result, and by which version of this program."""
+    """Return a result with the worker's address and its version of this program."""
     from distributed import get_worker
 
     return get_worker().address, program_version(), result
@@ -247,10 +247,10 @@ class LabelStatus:
 
     Attributes
     ----------
-    done, total : rows, those of earlier runs among them
-    n_colliding : of the rows done
-    labelled : rows of this run
-    seconds : since it began to label
+    done, total : numbers of rows, including those of earlier runs
+    n_colliding : number of colliding rows among those done
+    labelled : number of rows labelled in this run
+    seconds : time since this run began to label
     """
 
     done: int
@@ -261,12 +261,12 @@ class LabelStatus:
 
     @property
     def rows_per_second(self) -> float | None:
-        """Of this run, None before its first rows."""
+        """The rate of this run, None before its first rows."""
         return self.labelled / max(self.seconds, 1e-9) if self.labelled else None
 
     @property
     def seconds_left(self) -> float | None:
-        """At that rate, None before this run's first rows."""
+        """The remaining time at that rate, None before this run's first rows."""
         rate = self.rows_per_second
         return None if rate is None else (self.total - self.done) / rate
 
@@ -288,24 +288,24 @@ def label_poses(
 ) -> LabelStatus:
     """Extend a store to at least `n_rows` labelled samples of a model's latent box.
 
-    Goes on where an earlier run ended, however that ended; rows that are damaged, or missing before
+    Resume where an earlier run ended, however it ended; rows that are damaged, or missing before
     later ones, are labelled again. Sample i of (model, seed) has the same labels to the last bit on
-    any number of workers and on a cluster, so that several runs may label into one store.
+    any number of workers and on a cluster, so several runs may label into one store.
 
     Parameters
     ----------
     labeller : of the model
-    path : the store, made if there is none
+    path : the store, created if there is none
     n_rows : >= 1
     seed : of the samples, >= 0
     workers : threads, by default one per available core; unused with a scheduler
     scheduler : address of a Dask scheduler, such as "tcp://10.0.0.1:8786"
-    job : reports a `LabelStatus` after every block of rows, and is polled then; finished
-        chunks stay
+    job : reports a `LabelStatus` after every block of rows, and is polled then; finished chunks
+        are kept
 
     Returns
     -------
-    status : at the end, when all rows of the store are done
+    status : the final status, with all rows of the store done
 
     Raises
     ------
@@ -351,7 +351,7 @@ def label_poses(
         results = label_locally(labeller, seed, missing, n_threads, count, job)
     else:
         results = label_on_cluster(labeller, seed, missing, scheduler, count, job)
-    # Closed even when a chunk cannot be written: the workers must stop labelling.
+    # Close the generator even if a chunk cannot be written: the workers must stop labelling.
     with closing(results):
         for chunk, rows in results:
             store.write(chunk, rows)

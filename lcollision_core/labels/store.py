@@ -1,10 +1,10 @@
-"""The folder of labelled rows: a manifest, and one shard, a NumPy archive, for each chunk of rows.
+"""The folder of labelled rows: a manifest, and a shard, a NumPy archive, for each chunk of rows.
 
-``labels.json`` says what is labelled. ``FIRST-LAST.npz`` holds the columns of `LabelRows` of the
-samples FIRST to LAST; FIRST is a multiple of `ROWS_PER_CHUNK`, and of shards with one FIRST the
-longest counts. Rows are a function of the manifest and their indices alone, and a shard appears
-under its name whole: what is there is done, whoever wrote it. A damaged shard is found by the
-CRC-32 of its arrays, or by samples that do not match its name.
+``labels.json`` identifies the labelled data. ``FIRST-LAST.npz`` holds the columns of `LabelRows`
+of the samples FIRST to LAST; FIRST is a multiple of `ROWS_PER_CHUNK`, and of shards with the same
+FIRST the longest is used. Rows depend only on the manifest and their indices, and shards are
+written atomically: a shard that exists is complete, whoever wrote it. A damaged shard is detected
+by the CRC-32 of its arrays, or by samples that do not match its name.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from lcollision_core.model_file import required_array
 from lcollision_core.options import Draws
 
 FORMAT_VERSION = 3
-"""The version that stores are made in, and the only one that is read."""
+"""The version that stores are written in, and the only one that is read."""
 
 ROWS_PER_CHUNK = 1024
-"""Most rows that an interruption loses; a multiple of `ROWS_PER_BLOCK`."""
+"""Most rows lost by an interruption; a multiple of `ROWS_PER_BLOCK`."""
 
 MANIFEST = "labels.json"
 KIND = "lcollision labels"
@@ -49,13 +49,13 @@ def chunks_of(n_rows: int) -> Iterator[range]:
 
 
 class LabelStore:
-    """Samples of a model's latent box, from the first on, with their exact labels.
+    """The first samples of a model's latent box, with their exact labels.
 
-    Open one with `open` to read it; `label_poses` makes and extends them.
+    Use `open` to read a store; `label_poses` creates and extends stores.
 
     Attributes
     ----------
-    path, identity : where it is, and what it labels
+    path, identity : its folder, and the identity of its labels
     """
 
     def __init__(self, path: Path, identity: StoreIdentity) -> None:
@@ -74,7 +74,7 @@ class LabelStore:
 
         Raises
         ------
-        LabelStoreError : there is none, or it is of another program, of another version, or
+        LabelStoreError : there is none, it belongs to another program, has another version, or is
             damaged.
         """
         target = Path(path)
@@ -106,9 +106,9 @@ class LabelStore:
 
     @classmethod
     def draws_of(cls, path: str | os.PathLike[str], otherwise: Draws) -> Draws:
-        """Return what a store's samples are drawn from, or `otherwise` where no store can be read.
+        """Return how a store's samples are drawn, or `otherwise` if no store can be read.
 
-        What cannot be read is then refused by `open_or_make`.
+        `open_or_make` then refuses a store that cannot be read.
         """
         try:
             return cls.open(path).identity.draws
@@ -117,17 +117,17 @@ class LabelStore:
 
     @classmethod
     def open_or_make(cls, path: str | os.PathLike[str], identity: StoreIdentity) -> LabelStore:
-        """Open the store of an identity, made if there is none.
+        """Open the store of an identity, or create it if there is none.
 
         Parameters
         ----------
-        path : a folder that is a store, or empty, or that does not exist in one that does
-        identity : what the store must label
+        path : a store, an empty folder, or a folder to create in one that exists
+        identity : that the store must have
 
         Raises
         ------
-        LabelStoreError : as for `open`, or the store labels something else.
-        MeshFileError : it cannot be made.
+        LabelStoreError : as for `open`, or the store has another identity.
+        MeshFileError : it cannot be created.
         """
         target = Path(path)
         # A hidden file is the unfinished manifest of another run, alive or killed.
@@ -146,11 +146,11 @@ class LabelStore:
         return store
 
     def require(self, identity: StoreIdentity) -> None:
-        """Refuse a store of another model, seed, unit, box or other contact rules.
+        """Check that the store has a model, seed, body size, box and contact rules.
 
         Raises
         ------
-        LabelStoreError : naming the first difference.
+        LabelStoreError : the store has another identity; the message names the first difference.
         """
         for name, what in (
             ("model", "the model of fingerprint {}"),
@@ -178,7 +178,7 @@ class LabelStore:
 
     @property
     def n_rows(self) -> int:
-        """N, the rows up to the first that is missing."""
+        """N, the number of rows before the first missing one."""
         n_rows = 0
         while n_rows in self._ends:
             n_rows = self._ends[n_rows]
@@ -186,7 +186,7 @@ class LabelStore:
 
     @property
     def end(self) -> int:
-        """The index after the last row that there is, whether or not some before it are missing."""
+        """The index after the last row, even if earlier rows are missing."""
         return max(self._ends.values(), default=0)
 
     def load(self, n_rows: int | None = None) -> LabelRows:
@@ -194,7 +194,7 @@ class LabelStore:
 
         Parameters
         ----------
-        n_rows : how many, at most those that there are
+        n_rows : number of rows, at most `end`
 
         Raises
         ------
@@ -203,11 +203,11 @@ class LabelStore:
         return self.read(range(self.end if n_rows is None else n_rows))
 
     def read(self, rows: range) -> LabelRows:
-        """Read consecutive rows, of one shard or of several.
+        """Read consecutive rows from one or more shards.
 
         Parameters
         ----------
-        rows : of step 1, from 0 to at most `end`
+        rows : of step 1, within 0 to `end`
 
         Raises
         ------
@@ -235,7 +235,7 @@ class LabelStore:
         return LabelRows(**columns)
 
     def _read_shard(self, rows: range) -> LabelRows:
-        """Read the file of a chunk: its rows, from its first on, and what else it has of it."""
+        """Read the longest shard of a chunk, which may have more than the given rows."""
         end = self._ends.get(rows.start, 0)
         if end < rows.stop:
             raise self._unreadable(rows, "missing")
@@ -257,11 +257,11 @@ class LabelStore:
         return labelled
 
     def write(self, rows: range, labelled: LabelRows) -> None:
-        """Write a chunk, whole or not at all.
+        """Write a chunk atomically.
 
         Parameters
         ----------
-        rows : which, from the chunk's first on
+        rows : their indices, starting with the chunk's first
         labelled : these rows
 
         Raises
@@ -275,7 +275,7 @@ class LabelStore:
         self._ends[rows.start] = max(self._ends.get(rows.start, 0), rows.stop)
 
     def check(self, job: Job = UNWATCHED) -> tuple[range, ...]:
-        """Read everything, and return the rows that are damaged or missing before later ones.
+        """Read all rows and return those that are damaged, or missing before later ones.
 
         Parameters
         ----------
@@ -321,7 +321,7 @@ class LabelStore:
         return self.path / f"{rows[0]:010}-{rows[-1]:010}.npz"
 
     def _columns(self) -> dict[str, tuple[npt.DTypeLike, tuple[int, ...]]]:
-        """Return the type of each column of `LabelRows`, and the shape of a row of it."""
+        """Return the type of each column of `LabelRows`, and the shape of its rows."""
         return {
             "latent": (np.float32, (len(self.identity.box_low),)),
             "domain_energy": (np.float64, (self.identity.n_domains,)),

@@ -1,4 +1,4 @@
-"""Posing by hand: spaces of poses, grips and pins, drags that stay free of collisions."""
+"""Pose by hand: spaces of poses, grips and pins, drags that stay collision-free."""
 
 from lcollision_core.posing.dragger import (
     GRIP_RADIUS,

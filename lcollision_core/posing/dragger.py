@@ -1,4 +1,4 @@
-"""Drag a body by hand: goals of grips and pins, held out of contact step by step."""
+"""Drag a body by hand: goals of grips and pins, in steps that keep out of contact."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def largest_stretch(vertices: FloatArray, edges: IntArray, longest: FloatArray) 
     ----------
     vertices : (V, 3) float64 array, in normalised length
     edges : (E, 2) int32 array
-    longest : (E,) float64 array, likewise: see `PoseSpace.longest_edges`
+    longest : (E,) float64 array, in normalised length: see `PoseSpace.longest_edges`
     """
     largest = 0.0
     for edge in range(len(edges)):
@@ -40,12 +40,12 @@ def largest_stretch(vertices: FloatArray, edges: IntArray, longest: FloatArray) 
 def excess_stretch(
     vertices: FloatArray, edges: IntArray, longest: FloatArray, slope: FloatArray
 ) -> float:
-    """Measure what edges are stretched beyond 1: the root of the sum of squares.
+    """Return the root of the sum of squares of the edges' stretch beyond 1.
 
     Parameters
     ----------
     vertices, edges, longest : see `largest_stretch`
-    slope : (V, 3) float64 array, overwritten with its derivative by the vertices, 0 where no edge
+    slope : (V, 3) float64 array, overwritten with the derivative by the vertices, 0 where no edge
         is stretched
 
     Returns
@@ -91,7 +91,7 @@ class Grip:
 
     Attributes
     ----------
-    vertex : its middle, an index from 0
+    vertex : the vertex in its middle, an index from 0
     radius : normalised, along the surface
     vertices : (n,) int64 array, ascending
     weights : (n,) float64 array > 0 that sums to 1, falling off along the surface
@@ -104,7 +104,7 @@ class Grip:
 
     @classmethod
     def at(cls, vertex: int) -> Grip:
-        """Take one vertex alone."""
+        """Return a grip of a single vertex."""
         return cls(vertex, 0.0, np.array([vertex]), np.ones(1))
 
     def position(self, vertices: npt.NDArray[np.floating]) -> FloatArray:
@@ -135,8 +135,8 @@ class Pin:
     Attributes
     ----------
     vertex, radius : of the `Grip`
-    position : x, y, z of the patch's mean in the data's unit, in the model's frame
-    frame : further vertices of the same body part and their positions, of a pin that keeps the
+    position : x, y, z of the patch's mean in the data's unit, in model coordinates
+    frame : further vertices of the same body part and their positions, for a pin that keeps the
         orientation too
     """
 
@@ -147,7 +147,7 @@ class Pin:
 
     @classmethod
     def of(cls, grip: Grip, vertices: npt.NDArray[np.floating], frame: Iterable[int] = ()) -> Pin:
-        """Pin a patch, and further vertices, where (V, 3) vertices, in the data's unit, are."""
+        """Pin a patch and further vertices as in (V, 3) `vertices`, in the data's unit."""
 
         def point(place: FloatArray) -> Point:
             x, y, z = place.tolist()
@@ -158,12 +158,12 @@ class Pin:
         return cls(grip.vertex, grip.radius, point(grip.position(vertices)), others)
 
     def moved(self, grip: Grip, vertices: npt.NDArray[np.floating]) -> Pin:
-        """Return the same pin where (V, 3) vertices have its patch."""
+        """Return the same pin at its positions in (V, 3) vertices, in the data's unit."""
         return Pin.of(grip, vertices, (vertex for vertex, _ in self.frame))
 
     @property
     def patches(self) -> list[tuple[int, float, Point]]:
-        """The vertex, radius and position of all that stays."""
+        """The vertex, radius and position of each patch of the pin."""
         return [
             (self.vertex, self.radius, self.position),
             *((vertex, LEAST_RADIUS, place) for vertex, place in self.frame),
@@ -171,13 +171,13 @@ class Pin:
 
 
 def make_grip(space: PoseSpace, vertex: int, radius: float = GRIP_RADIUS) -> Grip:
-    """Take the patch round a vertex.
+    """Return the patch around a vertex.
 
     Parameters
     ----------
-    space : of the poses; the patch is the same in all of them, measured on the reference
+    space : of the poses; the patch is measured on the reference and the same in all poses
     vertex : index from 0
-    radius : put between `LEAST_RADIUS` and `LARGEST_RADIUS`
+    radius : clipped to `LEAST_RADIUS` and `LARGEST_RADIUS`
 
     Raises
     ------
@@ -185,7 +185,7 @@ def make_grip(space: PoseSpace, vertex: int, radius: float = GRIP_RADIUS) -> Gri
 
     Notes
     -----
-    A vertex at distance s along the edges weighs (1 - (s / r)^2)^2, the biweight kernel.
+    A vertex at distance s along the edges has weight (1 - (s / r)^2)^2, the biweight kernel.
     """
     n_vertices = space.topology.n_vertices
     if not 0 <= vertex < n_vertices:
@@ -194,20 +194,20 @@ def make_grip(space: PoseSpace, vertex: int, radius: float = GRIP_RADIUS) -> Gri
         )
     radius = float(np.clip(radius, LEAST_RADIUS, LARGEST_RADIUS))
     along = csgraph.dijkstra(space.surface_graph, directed=False, indices=vertex, limit=radius)
-    # A vertex at the rim weighs nothing.
+    # A vertex at the rim has weight 0.
     weights = np.clip(1.0 - (along / radius) ** 2, 0.0, None) ** 2
     inside = np.flatnonzero(weights > 0.0)
     return Grip(vertex, radius, inside, weights[inside] / weights[inside].sum())
 
 
 PIN_WEIGHT = 100.0
-"""Of the squared drift of a pin, against the squared miss of the grip."""
+"""Weight of the squared drift of a pin, relative to the squared miss of the grip."""
 
 STRETCH_WEIGHT = 0.01
-"""Of the sum of squares by which edges are longer than in any plausible pose, likewise."""
+"""Weight of the squared excess stretch of the edges, likewise."""
 
 STANDING_WEIGHT = 10.0
-"""Likewise of each point of what stands on the ground."""
+"""Weight of the squared drift of a point standing on the ground, likewise."""
 
 
 class Held(NamedTuple):
@@ -216,7 +216,7 @@ class Held(NamedTuple):
     Attributes
     ----------
     grip : the patch
-    place : (3,) float64 array, normalised, of its mean
+    place : (3,) float64 array, position of its mean, normalised
     weight : of the squared drift
     """
 
@@ -243,10 +243,10 @@ class Goal(Protocol):
 
     Attributes
     ----------
-    reach : the most of the miss that one step aims at
-    longest_step : of one step the most of the root of the mean squared vertex displacement, as one
-        quadratic models the cost only so far
-    price : factor of the price of what moves, see `PoseSpace.price`
+    reach : the largest part of the miss that one step aims at
+    longest_step : the largest root mean square vertex displacement of a step, within which one
+        quadratic models the cost
+    price : factor of the price of moving parts, see `PoseSpace.price`
     """
 
     reach: float
@@ -254,20 +254,20 @@ class Goal(Protocol):
     price: float
 
     def miss(self, pose: Decoded, target: FloatArray) -> float:
-        """Measure what is left to a target."""
+        """Return the distance left to a target."""
 
     def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the (D, D) hessian and (D,) gradient of half the squared miss by the codes."""
 
 
 class PatchGoal:
-    """A patch's mean goes to a point; other patches stay.
+    """Move a patch's mean to a point; other patches stay.
 
     Parameters
     ----------
     space : of the poses
     grip : the patch
-    pins : that stay
+    pins : patches that stay
     strength : of the price of stretched edges
 
     Attributes
@@ -283,7 +283,7 @@ class PatchGoal:
         self._weights = np.repeat([1.0, *(pin.weight for pin in pins)], 3)
 
     def miss(self, pose: Decoded, target: FloatArray) -> float:
-        """Measure the distance to the target."""
+        """Return the distance to the target."""
         return float(np.linalg.norm(target - self.grip.position(pose.vertices)))
 
     def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -294,13 +294,13 @@ class PatchGoal:
 
 
 class TwistGoal:
-    """A body part turns about its long axis by an angle; its middle and pinned patches stay.
+    """Turn a body part about its long axis by an angle; its middle and pinned patches stay.
 
     Parameters
     ----------
     space : of the poses
     domain : the body part
-    pins : that stay
+    pins : patches that stay
     strength : of the price of stretched edges
     decoded : (V, 3) float64 array, the vertices at the drag's start
     """
@@ -329,23 +329,23 @@ class TwistGoal:
         return arms
 
     def _angle(self, arms: FloatArray) -> float:
-        """Return by which angle the part has turned about the axis since the start."""
+        """Return the angle by which the part has turned about the axis since the start."""
         before, now = (np.cross(self.axis, arm) for arm in (self._arms, arms))
         return float(
             np.arctan2((np.cross(self._arms, arms) @ self.axis).sum(), (before * now).sum())
         )
 
     def miss(self, pose: Decoded, target: FloatArray) -> float:
-        """Measure the angle that is left, in radians."""
+        """Return the angle left to the target, in radians."""
         return abs(float(target[0]) - self._angle(self._arms_of(pose.vertices)))
 
     def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """See `Goal.cost`; the miss is the way of a vertex at the part's mean distance."""
+        """See `Goal.cost`; the miss is the path of a vertex at the part's mean radius."""
         arms = self._arms_of(pose.vertices)
         across = np.cross(self.axis, arms)
         radius = np.sqrt((across**2).sum() / len(arms))
         left = float(target[0]) - self._angle(arms)
-        # The turn: the mean of the motions across the axis.
+        # The rotation is the mean of the motions across the axis.
         turn = np.zeros_like(pose.vertices)
         turn[self._part.vertices] = across / (radius * len(arms))
         way = np.array([radius * np.clip(left, -self.reach, self.reach)])
@@ -354,7 +354,7 @@ class TwistGoal:
 
 
 class CodesGoal:
-    """The codes go to others; those that the target leaves as they were at the start stay.
+    """Move the codes to a target; codes whose target is their start value stay.
 
     Parameters
     ----------
@@ -368,7 +368,7 @@ class CodesGoal:
         self._space = space
 
     def miss(self, pose: Decoded, target: FloatArray) -> float:
-        """Measure the root of the mean squared vertex displacement that is left, roughly."""
+        """Return the remaining root mean square vertex displacement, to first order."""
         way = target - pose.codes
         return float(np.sqrt(way @ self._space.metric @ way))
 
@@ -380,7 +380,7 @@ class CodesGoal:
 
 
 def _mean_slopes(space: PoseSpace, patches: Sequence[Grip]) -> MeanSlopes:
-    """Solve once for the means of all patches that a drag moves or holds."""
+    """Solve once for the means of all patches that a drag moves or holds in place."""
     weights = np.concatenate([patch.weights for patch in patches])
     vertices = np.concatenate([patch.vertices for patch in patches])
     ends = np.cumsum([0, *(len(patch.vertices) for patch in patches)])
@@ -408,10 +408,10 @@ def _squares(
     strength: float,
     *others: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Gauss-Newton of half the weighted squares of the (r,) ways that are left.
+    """Return the Gauss-Newton hessian and gradient of half the weighted squares of the misses.
 
-    They are of the means, then of what has the (V, 3) derivatives `others`. The excess stretch of
-    the edges is one more of them.
+    The (r,) misses `ways` are those of the means, then those whose (V, 3) derivatives by the
+    vertices are `others`. The excess stretch of the edges is added to them.
     """
     slope = np.empty_like(pose.vertices)
     excess = excess_stretch(pose.vertices, space.topology.edges, space.longest_edges, slope)
@@ -425,54 +425,55 @@ def _squares(
 
 
 MAX_STEPS = 3
-"""Steps of one event: where the pointer leapt, the next events go on."""
+"""Most steps per event; where the pointer leapt, the next events continue."""
 
 PATIENCE = 3
-"""Events in a row that come no nearer to the target, after which more of the body joins in."""
+"""Successive events without progress after which more of the body joins in."""
 
 ROUNDS = 3
-"""Times that a step is solved with the contacts that it ran into before."""
+"""Most times that a step is solved, each time with the contacts that it ran into before."""
 
 CUTS = (0.5, 0.25, 0.1)
-"""Fractions of a step that are tried where it still collides after the last round."""
+"""Fractions of a step that are tried if it still collides after the last round."""
 
 LEAST_PACE, FASTER = 0.125, 1.5
-"""Of the longest step: what is tried at least, and the factor after a step that came nearer."""
+"""Least share of the longest step, and the factor of the share after a step that came nearer."""
 
 KEPT_CONTACTS = 18
 
 DAMPING = 0.02
-"""Price of the mean squared vertex displacement of a step, against the squared miss of the grip."""
+"""Price of the mean squared vertex displacement of a step, relative to the squared miss."""
 
 IMPLAUSIBLE = 3e-6
 """Price of the squared Mahalanobis distance from the drag's start: see `PoseSpace.precision`."""
 
 STRETCH = 0.14
-"""The most by which a drag of strength 1 makes an edge longer than it is in any plausible pose."""
+"""Largest relative excess of an edge's length over plausible poses in a drag of strength 1."""
 
 _NEAR, _WORTHWHILE, _SHORT, _SETTLED = 0.5, 0.5, 0.25, 0.01
-"""Of a goal's reach: a miss that the next event takes, the gain of a step that another follows at
-once, the gain of one that comes no nearer, and the miss or gain of one that no other follows."""
+"""Shares of a goal's reach: a miss that is left to the next event, the gain from which another step
+follows at once, the gain below which there is no progress, and the miss or gain below which the
+drag has settled."""
 
 _ROUNDING = 1e-6
 """Fraction by which the squared depths of a contact vary with the rounding of the vertices."""
 
 _STILL = 1e-5
-"""Root of the mean squared vertex displacement, normalised, of a step that is none."""
+"""Normalised root mean square vertex displacement below which a step counts as none."""
 
 
 @dataclass(frozen=True)
 class DragOptions:
-    """What a drag keeps to.
+    """Options of a drag.
 
     Attributes
     ----------
-    solid : keep the pose out of itself
+    solid : whether to keep the pose from penetrating itself
     strength : of the prices of implausible poses and stretched limbs: 0 for none
     locked_domains : body parts whose codes stay
-    locked_codes : further codes that stay, by number
-    standing : what stands on the ground stays there, unless its limb is dragged
-    whole_body : all of it helps, not only the limb that is held
+    locked_codes : further codes that stay, by index
+    standing : whether parts on the ground stay there, unless their limb is dragged
+    whole_body : whether the whole body helps, not only the limb that is held
     clearance : in [0, 1), normalised, that a solid drag keeps between parts
     """
 
@@ -487,20 +488,20 @@ class DragOptions:
 
 @dataclass(frozen=True, eq=False)
 class DragStep:
-    """Where one event of a drag has led.
+    """The result of one event of a drag.
 
     Attributes
     ----------
     latent : (D,) float64 array, read-only
-    vertices : (V, 3) float32 array, read-only, in the data's unit, in the model's frame
-    miss : what is left to the target: normalised length, radians of a twist
-    found : the exact check of these vertices where they are exported to, without excluded pairs,
-        with the clearance of the drag; None of a drag that is not solid
-    crossing : the same without the clearance: what the pose shares with itself
-    contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact keeps
-        the pose from going on
+    vertices : (V, 3) float32 array, read-only, in the data's unit, in model coordinates
+    miss : distance left to the target: normalised length, or radians for a twist
+    found : the exact check of these vertices as exported, without excluded pairs, with the
+        clearance of the drag; None if the drag is not solid
+    crossing : the same without the clearance: pairs that penetrate
+    contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact stops
+        the pose
     standing : (S, 3) float64 array, points of the surface, likewise, that stay on the ground
-    settled : whether the same target would lead no further
+    settled : whether another event with the same target would make no progress
     """
 
     latent: FloatArray
@@ -519,17 +520,17 @@ class DragStep:
 
 
 class PoseDragger:
-    """Drags poses of one space; for one thread at a time.
+    """Drag poses of one space; for one thread at a time.
 
-    After `begin` each `move` is one event of the pointer. It moves the limb that is held; only
-    where that comes no nearer to the target, what it hangs on joins in, limb by limb. What hangs on
-    what moves follows it. A solid drag that starts free stays exactly free; one that starts
-    colliding deepens the contact of no two body parts.
+    After `begin` each `move` is one event of the pointer. It moves the limb that is held. Only if
+    that makes no progress, the limbs that it hangs on join in, one by one. Limbs that hang on a
+    moving one follow it. A solid drag that starts free stays exactly free; one that starts
+    colliding does not deepen the contact of any two body parts.
 
     Parameters
     ----------
     check : decodes and checks the poses, placed for export
-    up : (3,) unit vector, away from the ground; not needed for drags of codes alone
+    up : (3,) unit vector, away from the ground; not needed for drags of codes
     """
 
     def __init__(self, check: ExactCheck, up: FloatArray | None = None) -> None:
@@ -549,19 +550,19 @@ class PoseDragger:
         Parameters
         ----------
         latent : (D,) finite array; codes beyond their bounds may stay there
-        grip : what `move` gets the targets of: a patch, a twist, or the codes themselves where
-            None; then codes that a target leaves as they were do not move
-        pins : patches that stay in their places; those of codes do not
+        grip : the object that the targets of `move` are for: a patch, a twist, or the codes if
+            None; then codes that a target does not change stay
+        pins : patches that stay in their places; ignored in a drag of codes
         options : the defaults if None
 
         Returns
         -------
-        step : the pose as it is
+        step : the initial pose
 
         Raises
         ------
-        ShapeError : another shape, a number that is not finite, or a clearance out of its range.
-        LCollisionError : a pin or a body part to twist that the mesh does not have.
+        ShapeError : another shape, a number that is not finite, or a clearance out of range.
+        LCollisionError : the mesh lacks a pin's vertex or the body part to twist.
         """
         space = self._space
         self._goal = None
@@ -593,7 +594,7 @@ class PoseDragger:
         return self._result(0.0, settled=True)
 
     def _take(self, grip: Grip | Twist, pins: Iterable[Pin]) -> Goal:
-        """Find what moves and what stays as a patch or a body part is held."""
+        """Find which codes move and which patches stay when a patch or a body part is dragged."""
         space, limbs, options = self._space, self._space.limbs, self._options
         here = self._here.vertices
         if isinstance(grip, Grip):
@@ -620,13 +621,13 @@ class PoseDragger:
             ]
         pinned = [limbs.holding(stay.grip.vertices, stay.grip.weights) for stay in stays]
         if any(held_joints in limbs.limb(end, LEAST_LIMB)[1:] for end in pinned):
-            # A pinned hand slows its arm: the trunk helps only where that has come to a stop.
+            # A pinned hand slows its arm: the trunk helps only once the arm has stopped.
             self._helps_at = _SETTLED, _NEAR
         pinned += [int(limbs.leads[stand.grip.vertex]) for stand in self._stands]
         reaches = [set(reach) for reach in limbs.reaches(held_joints, least)]
-        # A twist of a learned model's body part needs its neighbours, as they turn in space.
+        # Twisting a learned model's body part needs its neighbours, as domains turn in space.
         if options.whole_body or (isinstance(grip, Twist) and not limbs.is_relative):
-            # Without a hold on the ground, the body would float to the target.
+            # A body without a hold would float to the target.
             root = limbs.path(held_joints)[-1]
             floats = limbs.is_relative and not pinned and held_joints != root
             reaches = [set(limbs.body(held_joints)) - ({root} if floats else set())]
@@ -637,7 +638,7 @@ class PoseDragger:
             self._reaches.append(moving)
         self._held = limbs.with_pinned(limbs.limb(held_joints, least), pinned)
         self._let_move()
-        # What nothing moves need not be kept.
+        # Parts that cannot move need no hold.
         self._stands = [
             stand
             for stand in self._stands
@@ -649,20 +650,20 @@ class PoseDragger:
         return TwistGoal(space, grip.domain, stays, options.strength, here)
 
     def _let_move(self) -> None:
-        """Let the codes move of what comes next into reach."""
+        """Let the codes of the next reach move."""
         self._n_short = 0
         moving = self._space.limbs.codes_of(self._reaches.pop(0))
         self._low = np.where(moving, self._least, self._start)
         self._high = np.where(moving, self._most, self._start)
 
     def move(self, target: npt.ArrayLike) -> DragStep:
-        """Go towards a target, by a few short steps at most.
+        """Move towards a target, by a few short steps at most.
 
         Parameters
         ----------
-        target : of a patch (3,), a point in the data's unit, in the model's frame; of a twist an
-            angle in radians since the start; of codes (D,). With a number that is not finite the
-            pose stays.
+        target : for a patch (3,), a point in the data's unit, in model coordinates; for a twist an
+            angle in radians since the start; for codes (D,). If a number is not finite, the pose
+            stays.
 
         Raises
         ------
@@ -684,14 +685,14 @@ class PoseDragger:
                 break
             left = goal.miss(self._here, aim)
             if miss > goal.reach:
-                # Long steps along bent contacts would swing about the nearest place for ever.
+                # Long steps along curved contacts would oscillate about the nearest pose.
                 pace = self._pace * (0.5 if left > miss else FASTER)
                 self._pace = min(max(pace, LEAST_PACE), 1.0)
             miss, gain = left, miss - left
-            # Further steps are for a pointer that leapt, not for one that is out of reach.
+            # More steps are for a pointer that leapt, not for one that is out of reach.
             if left < _NEAR * goal.reach or gain < _WORTHWHILE * goal.reach:
                 break
-        # A step that was too long is no reason to stop; along contacts it would swing for ever.
+        # An overshoot is no reason to settle, except in solid drags, which could oscillate.
         gained = gain if self._options.solid else abs(gain)
         settled = min(miss, gained) < _SETTLED * goal.reach
         least_gain, near = self._helps_at
@@ -711,12 +712,12 @@ class PoseDragger:
             and miss > goal.reach
             and self._contacts.normals.size
         ):
-            # Contacts seen from earlier poses may limit what is no longer in the way: look afresh.
+            # Contacts of earlier poses may block a path that is clear now: forget them once.
             self._contacts, self._has_forgotten, settled = Contacts(self._check), True, False
         return self._result(miss, settled)
 
     def _more_may_move(self, goal: Goal) -> bool:
-        """Whether there is more that could help, and no contact is in the way."""
+        """Whether more limbs could help and no contact is in the way."""
         return (
             bool(self._reaches)
             and isinstance(goal, PatchGoal)
@@ -725,16 +726,16 @@ class PoseDragger:
         )
 
     def end(self) -> None:
-        """End the drag; its contacts are forgotten."""
+        """End the drag."""
         self._goal = None
 
     def _step(self, goal: Goal, aim: FloatArray) -> bool:
-        """Go one step; False if there is none to go."""
+        """Take one step; return False if none is possible."""
         space, here = self._space, self._here.codes
         low, high = self._low, self._high
         hessian, gradient = goal.cost(self._here, aim)
         if isinstance(goal, CodesGoal):
-            # Like the pose itself, its target may lie beyond the bounds.
+            # The target may lie beyond the bounds, as the pose may.
             is_free = low < high
             low = np.where(is_free, np.minimum(low, aim), low)
             high = np.where(is_free, np.maximum(high, aim), high)
@@ -754,7 +755,7 @@ class PoseDragger:
                 hessian, gradient, here, low, high, self._contacts.normals, self._contacts.offsets
             )
             if there is None:
-                # Contacts seen from different poses contradict each other.
+                # Contacts of different poses contradict each other.
                 self._contacts = Contacts(self._check)
                 continue
             way = there - here
@@ -771,9 +772,9 @@ class PoseDragger:
     def _may_land(
         self, goal: CodesGoal, aim: FloatArray, low: FloatArray, high: FloatArray
     ) -> bool:
-        """Whether codes are one step away, and nothing is known to be in the way.
+        """Whether the target codes are one step away, and no known contact is in the way.
 
-        The quadratic program would leave its tolerance.
+        The quadratic program would reach them only within its tolerance.
         """
         contacts = self._contacts
         return bool(
@@ -783,7 +784,7 @@ class PoseDragger:
         )
 
     def _goes(self, there: FloatArray) -> bool:
-        """Go to codes if the pose may be there; else remember what is in the way."""
+        """Move to codes if their pose is allowed; else remember the contacts in the way."""
         check = self._check
         decoded = check.decode(there)[0]
         stretch = self._stretch_of(decoded)
@@ -811,7 +812,7 @@ class PoseDragger:
         return True
 
     def _stretch_of(self, decoded: FloatArray) -> float:
-        """Return the excess length of the longest edge, priced; codes may stretch what they do."""
+        """Return the priced excess of the most stretched edge; 0 in drags of codes."""
         if isinstance(self._goal, CodesGoal) or self._options.strength == 0.0:
             return 0.0
         edges, longest = self._space.topology.edges, self._space.longest_edges
@@ -826,7 +827,7 @@ class PoseDragger:
             crossing = self._plain.find(self._plain.exported(self._here.vertices))
         touching = np.unique(self._contacts.touching(latent))
         if not len(touching):
-            # Contacts on all sides leave no half-space that the pose has reached.
+            # A pose with contacts on all sides may have reached no half-space.
             touching = np.unique(self._blocking)
         return DragStep(
             latent=latent,

@@ -30,17 +30,17 @@ from lcollision_core.posing.pose_space import PoseSpace
 def exported_vertices(
     vertices: npt.NDArray[Any], placement: RigidTransform | None = None
 ) -> npt.NDArray[np.floating]:
-    """Return the vertices that a pose is exported with.
+    """Return the vertices with which a pose is exported.
 
     Parameters
     ----------
     vertices : (..., V, 3) array, in the data's unit
-    placement : where a decoded pose is exported to; None leaves it where it is
+    placement : applied to the pose; None for the model's own coordinates
 
     Returns
     -------
-    exported : (..., V, 3) array: as they are drawn, float32; with a placement, which may
-        be far from the origin, moved there in float64
+    exported : (..., V, 3) array, float32 as drawn; with a placement, which may be far from the
+        origin, moved there in float64
     """
     drawn: npt.NDArray[np.float32] = vertices.astype(np.float32)
     return drawn if placement is None else placement.apply(drawn)
@@ -49,7 +49,7 @@ def exported_vertices(
 def in_each_format(
     exported: npt.NDArray[np.floating], topology: Topology
 ) -> list[npt.NDArray[np.floating]]:
-    """Return one pose's exported (V, 3) vertices as each of the formats holds them.
+    """Return one pose's exported (V, 3) vertices as each format holds them.
 
     A placed pose is written in float64 and, by formats that hold no more, in float32, if that
     preserves its shape: see `lcollision_core.files.mesh_file`.
@@ -61,18 +61,18 @@ def in_each_format(
 
 @dataclass(frozen=True, eq=False)
 class ExactCheck:
-    """Decodes poses and tests them as they are exported; safe to share between threads.
+    """Decode poses and test them as they are exported; safe to share between threads.
 
-    A pose is free when it is in each format that can hold it; with a clearance, when no pair that
+    A pose is free if it is so in each format that can hold it; with a clearance, if no pair that
     counts is nearer than that.
 
     Attributes
     ----------
-    space : decodes; of a frame of a motion, the poses of the body as it is in that frame
+    space : decodes the poses; for a frame of a motion, with the body's shape in that frame
     detector : in the data's unit
     body_size : in the data's unit
-    placement : where a pose is exported to, None for the model's own coordinates
-    hidden : faces that count in no pair, as they are scaled to nothing
+    placement : applied to exported poses; None for the model's own coordinates
+    hidden : faces scaled to nothing, which count in no pair
     """
 
     space: PoseSpace
@@ -83,7 +83,7 @@ class ExactCheck:
 
     @property
     def clearance(self) -> float:
-        """That of the detector, normalised; 0 where a pose may touch itself."""
+        """The detector's clearance, normalised; 0 if a pose may touch itself."""
         return self.detector.clearance
 
     def with_clearance(self, clearance: float) -> ExactCheck:
@@ -97,20 +97,20 @@ class ExactCheck:
         return self.detector.without(self.hidden) if len(self.hidden) else self.detector
 
     def decode(self, latent: npt.ArrayLike) -> FloatArray:
-        """Decode (B, D) latent poses to (B, V, 3) vertices, normalised, in the model's frame."""
+        """Decode (B, D) latent poses to normalised (B, V, 3) vertices, in model coordinates."""
         return self.space.decode(np.atleast_2d(np.asarray(latent)))
 
     def exported(self, decoded: FloatArray) -> npt.NDArray[np.floating]:
-        """Return decoded (..., V, 3) vertices, normalised, as they are exported."""
+        """Return decoded, normalised (..., V, 3) vertices as they are exported."""
         return exported_vertices(decoded * self.body_size, self.placement)
 
     def drawn(self, decoded: FloatArray) -> npt.NDArray[np.float32]:
-        """Return decoded (V, 3) vertices, normalised, as they are drawn: in the model's frame."""
+        """Return decoded, normalised (V, 3) vertices as they are drawn, in model coordinates."""
         drawn: npt.NDArray[np.float32] = (decoded * self.body_size).astype(np.float32)
         return drawn
 
     def are_free(self, latent: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Tell which of (B, D) latent poses are collision-free: (B,) bool."""
+        """Return (B,) whether each of (B, D) latent poses is collision-free."""
         codes = np.atleast_2d(np.asarray(latent))
         free = None
         if self.placement is None and not len(self.hidden):
@@ -118,15 +118,15 @@ class ExactCheck:
         return self.are_free_meshes(self.exported(self.decode(codes))) if free is None else ~free
 
     def is_free(self, latent: npt.ArrayLike) -> bool:
-        """Tell whether one (D,) latent pose is collision-free."""
+        """Return whether one (D,) latent pose is collision-free."""
         return bool(self.are_free(latent)[0])
 
     def is_free_mesh(self, exported: npt.NDArray[np.floating]) -> bool:
-        """Tell whether (V, 3) vertices are free where they are exported to."""
+        """Return whether exported (V, 3) vertices are collision-free."""
         return bool(self.are_free_meshes(exported[None])[0])
 
     def are_free_meshes(self, exported: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
-        """Tell which of (B, V, 3) vertices are free where they are exported to: (B,) bool."""
+        """Return (B,) whether each pose of exported (B, V, 3) vertices is collision-free."""
         find = partial(self._seeing.are_colliding, workers=1, unit=self._unit)
         free: npt.NDArray[np.bool_] = ~find(exported)
         if exported.dtype != np.float32:
@@ -141,13 +141,13 @@ class ExactCheck:
     def find(
         self, exported: npt.NDArray[np.floating], *, counted_only: bool = True
     ) -> SelfCollisions:
-        """Find the colliding pairs of (V, 3) vertices where they are exported to.
+        """Find the colliding pairs of exported (V, 3) vertices.
 
-        Those in float64 where it collides in that, else those in float32.
+        They are the pairs in float64 if the pose collides there, else those in float32.
 
         Parameters
         ----------
-        counted_only : whether to leave out those that a contact rule excludes, which is faster
+        counted_only : whether to leave out pairs that a contact rule excludes, which is faster
         """
         for form in in_each_format(exported, self.detector.topology):
             collisions = self._seeing.detect(form, unit=self._unit, counted_only=counted_only)
@@ -158,17 +158,17 @@ class ExactCheck:
     def collide_between(
         self, start: npt.NDArray[np.floating], end: npt.NDArray[np.floating]
     ) -> bool:
-        """Tell whether vertices touch on the linear path from where they are exported to another.
+        """Return whether vertices touch on the linear path between two exported poses.
 
         Both are (V, 3); `start` is free. See `CollisionDetector.collide_between`.
         """
         return self._seeing.collide_between(start, end, unit=self._unit)
 
     def least_distance(self, exported: npt.NDArray[np.floating]) -> NearestPair | None:
-        """Find where (V, 3) vertices come nearest to each other, where they are exported to.
+        """Find where exported (V, 3) vertices come nearest to each other.
 
-        In the format in which that is nearest; None where nothing is nearer than `DISTANCE_BOUND`,
-        nor than the clearance.
+        Of all formats the nearest pair is returned; None if no pair is nearer than `DISTANCE_BOUND`
+        or the clearance, whichever is larger.
         """
         bound = max(DISTANCE_BOUND, self.clearance)
         nearest_pairs = (
@@ -183,7 +183,7 @@ class ExactCheck:
 
 
 def lack_slopes(triangles_a: FloatArray, triangles_b: FloatArray) -> FloatArray:
-    """Differentiate by their corners what pairs of triangles lack of a clearance.
+    """Differentiate the distance that pairs of triangles lack of a clearance by their corners.
 
     Parameters
     ----------
@@ -191,8 +191,8 @@ def lack_slopes(triangles_a: FloatArray, triangles_b: FloatArray) -> FloatArray:
 
     Returns
     -------
-    slopes : (P, 6, 3) float64 array: minus that of the distance where a pair is apart, else that of
-        the penetration depth
+    slopes : (P, 6, 3) float64 array: minus the derivative of the distance where a pair is apart,
+        else that of the penetration depth
     """
     _, slopes = depth_slopes(triangles_a, triangles_b)
     distance, by_distance = distance_slopes(triangles_a, triangles_b)
@@ -208,16 +208,17 @@ def add_slopes(
     *,
     may_be_apart: bool,
 ) -> None:
-    """Add to rows of derivatives by a pose's vertices the slopes of its colliding pairs.
+    """Add the slopes of colliding pairs to rows of derivatives by a pose's vertices.
 
     Parameters
     ----------
     by_vertices : (R, V, 3) float64 array, added to in place
-    row_of_pair : (P,) where each pair goes
+    row_of_pair : (P,) the row of each pair
     faces : (P, 2, 3) vertices of each pair
     decoded : (V, 3) float64 array, normalised
     weights : (P,) factors of the slopes
-    may_be_apart : whether pairs were found by a clearance, so that slopes are of what they lack
+    may_be_apart : whether pairs were found with a clearance, so that slopes are those of the
+        distances that they lack
     """
     triangles = decoded[faces[:, 0]], decoded[faces[:, 1]]
     slopes = lack_slopes(*triangles) if may_be_apart else depth_slopes(*triangles)[1]
@@ -229,7 +230,7 @@ MAX_REGIONS = 6
 """Most contacts of a pose, one for each of the deepest pairs of domains."""
 
 CLEARANCE = 2e-4
-"""In normalised length: gap that touching surfaces are moved to, as the model is linear."""
+"""Gap to which touching surfaces are moved, in normalised length, as the model is linear."""
 
 _OPTIMAL = 1
 _TOLERANCE = 1e-9
@@ -237,15 +238,15 @@ _TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class ContactRegions:
-    """The colliding pairs of one pose, grouped by the two body parts that they are of.
+    """The colliding pairs of one pose, grouped by their two body parts.
 
     Attributes
     ----------
     names : (C,) int64 array, ascending: K a + b for parts a <= b
     of_pair : (P,) int64 array, each pair's index into `names`
-    depth : (C,) float64 array > 0: the mean of a region's depths weighted by their squares, so that
-        it is the depth of the deepest where one stands out; normalised
-    squared_depth : (C,) float64 array > 0, the sum over a region, normalised
+    depth : (C,) float64 array > 0, normalised: the mean of a region's depths weighted by their
+        squares, which is near the largest depth if one stands out
+    squared_depth : (C,) float64 array > 0, the sum of a region's squared depths, normalised
     """
 
     names: npt.NDArray[np.int64]
@@ -281,26 +282,27 @@ def contact_slopes(
     *,
     may_be_apart: bool = False,
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
-    """Measure how the depths of a colliding pose's contacts change with its codes.
+    """Differentiate the depths of a colliding pose's contacts by its codes.
 
-    The slope of a region's depth is the mean of its pairs' slopes with the weights of their depths.
+    The slope of a region's depth is the mean of its pairs' slopes, weighted by their squared
+    depths.
 
     Parameters
     ----------
     codes : (D,) float64 array
-    decoded : (V, 3) float64 array, its vertices in normalised length
-    found : its colliding pairs, at least one
+    decoded : (V, 3) float64 array, the pose's vertices in normalised length
+    found : the pose's colliding pairs, at least one
     regions : of `found`
-    may_be_apart : whether pairs were found by a clearance, of which some do not penetrate
+    may_be_apart : whether pairs were found with a clearance, so that some do not penetrate
 
     Returns
     -------
-    deepest : (C,) the regions that count, the deepest first, at most `MAX_REGIONS`
+    deepest : (C,) indices of the deepest regions, at most `MAX_REGIONS`, the deepest first
     slopes : (C, D) float64 array
 
     Notes
     -----
-    A pair's depth is at most the size of its triangles, so this leads out of shallow contact only.
+    A pair's depth is at most the size of its triangles, so this resolves only shallow contact.
     """
     share = found.penetration_depth**2 / regions.squared_depth[regions.of_pair]
     deepest = np.argsort(-regions.depth, kind="stable")[:MAX_REGIONS]
@@ -311,11 +313,11 @@ def contact_slopes(
 
 
 class Contacts:
-    """Half-spaces of codes that separate the contacts seen so far.
+    """Half-spaces of codes that separate the contacts found so far.
 
     Parameters
     ----------
-    check : decodes and finds the contacts
+    check : decodes poses and finds their contacts
 
     Attributes
     ----------
@@ -330,7 +332,7 @@ class Contacts:
         self.vertices = np.empty(0, dtype=np.int64)
 
     def add(self, codes: FloatArray) -> bool:
-        """Add the contacts of (D,) codes; False if the pose is free and has none."""
+        """Add the contacts of (D,) codes; return False if the pose is free."""
         decoded = self._check.decode(codes)[0]
         collisions = self._check.find(self._check.exported(decoded))
         if collisions.colliding:
@@ -347,12 +349,12 @@ class Contacts:
         regions: ContactRegions,
         allowed: Mapping[int, float] | None = None,
     ) -> None:
-        """Add half-spaces in which the deepest contacts of a pose are gone, to first order.
+        """Add half-spaces in which the deepest contacts of a pose vanish to first order.
 
         Parameters
         ----------
         codes, decoded, found, regions : see `contact_slopes`
-        allowed : depths that regions may keep, normalised, by their names
+        allowed : normalised depths that regions may keep, by their names
         """
         apart = self._check.clearance > 0.0
         deepest, slopes = contact_slopes(
@@ -380,11 +382,11 @@ class Contacts:
         return self.vertices[self.normals @ codes >= self.offsets - CLEARANCE]
 
     def drop_refuted(self, free: FloatArray) -> None:
-        """Forget half-spaces that a free pose lies outside: they were extrapolated too far."""
+        """Drop half-spaces that do not hold a free pose: they were extrapolated too far."""
         self._keep(np.flatnonzero(self.normals @ free <= self.offsets + CLEARANCE))
 
     def keep_latest(self, most: int) -> None:
-        """Forget all half-spaces but so many, those that were added last."""
+        """Drop all but the `most` latest half-spaces."""
         self._keep(np.arange(len(self.offsets))[-most:])
 
     def _keep(self, kept: npt.NDArray[np.intp]) -> None:
@@ -405,7 +407,7 @@ def nearest_within(
     Parameters
     ----------
     metric : (D, D) positive definite float64 array
-    centre : (D,) float64 array between `low` and `high`, which are equal where a code is locked
+    centre : (D,) float64 array between `low` and `high`, which are equal for a locked code
     normals, offsets : (C, D) and (C,) float64 arrays: normals Z <= offsets
 
     Returns
@@ -426,7 +428,7 @@ def least_step(
 ) -> FloatArray | None:
     """Minimise d^T hessian d / 2 + gradient^T d for codes start + d in half-spaces and bounds.
 
-    Parameters are those of `nearest_within`, and `gradient` (D,).
+    Parameters are those of `nearest_within`, with `start` for `centre`, and `gradient` (D,).
 
     Returns
     -------
@@ -442,7 +444,7 @@ def least_step(
         return start.copy() if (normals @ start <= offsets).all() else None
     quadratic = hessian[np.ix_(movable, movable)]
     scale = len(quadratic) / np.trace(quadratic)
-    # The bounds of the moves come first, then the half-spaces.
+    # Bounds of the steps come first, then the half-spaces.
     most = np.concatenate([(high - start)[movable], offsets - normals @ start])
     least = np.concatenate([(low - start)[movable], np.full(len(normals), -np.inf)])
     moved, _, status, _ = daqp.solve(

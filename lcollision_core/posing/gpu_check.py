@@ -1,4 +1,4 @@
-"""Poses by their codes to verdicts on a GPU, where what decodes them runs there."""
+"""Decode codes and check their poses on a GPU, if the space decodes there."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lcollision_core.posing.pose_space import PosesOnGpu, PoseSpace
 
 @lru_cache(maxsize=2)
 def _decoder_of(space: Any, body_size: float) -> PosesOnGpu | None:
-    """Return a space's decoder; so few bodies are checked at a time, and each holds its tables."""
+    """Return a space's decoder; only a few are kept, as each holds tables on the GPU."""
     decoder: PosesOnGpu | None = space.gpu_decoder(body_size)
     return decoder
 
@@ -25,16 +25,16 @@ def _decoder_of(space: Any, body_size: float) -> PosesOnGpu | None:
 def colliding_on_gpu(
     detector: CollisionDetector, space: PoseSpace, body_size: float, codes: FloatArray
 ) -> npt.NDArray[np.bool_] | None:
-    """Tell which of (B, D) codes collide, decoded and checked on a GPU.
+    """Decode and check (B, D) codes on a GPU, and return which poses collide.
 
     Parameters
     ----------
     detector : in the data's unit
-    space, body_size : decode to vertices, float32 in that unit
+    space, body_size : decode to float32 vertices in that unit
 
     Returns
     -------
-    colliding : (B,) bool; None where that is left to the processor
+    colliding : (B,) bool; None if the check is left to the CPU
     """
     if detector.clearance > 0.0 or not takes_gpu(len(codes), space.topology.n_faces):
         return None

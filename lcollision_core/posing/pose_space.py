@@ -1,4 +1,4 @@
-"""The space in which a body is posed: codes, limits, parts."""
+"""The space in which a body is posed: codes, limits, body parts."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from lcollision_core.meshes.limbs import Limbs, far_apart
 from lcollision_core.meshes.topology import FloatArray, Topology, length_graph
 
 MeanSlopes = Callable[[FloatArray, FloatArray], FloatArray]
-"""Derivatives by the codes, (3 m + n, D), of (D,) codes and (n, V, 3) derivatives by the vertices:
-see `PoseSpace.mean_slopes`."""
+"""Take (D,) codes and (n, V, 3) derivatives by vertices; return (3 m + n, D) derivatives by the
+codes: see `PoseSpace.mean_slopes`."""
 
 _HOLD, _MOVED = 0.1, 0.02
-"""Price of the mean squared displacement of a body part since a drag began, and the root of it,
-normalised, at which the price is half."""
+"""Price of the mean squared displacement of a body part since a drag began, and the normalised root
+mean square displacement at which the price is half."""
 
 _RELUCTANT = 10.0
-"""Factor of that price, of body parts other than those of the limb that is held."""
+"""Factor of that price for body parts outside the limb that is held."""
 
 _JACOBIAN_POSES = 8
 _REMEMBERED_POSES = 8
-"""Poses of which features and vertices are kept: a drag and a Resolve come back to them."""
+"""Poses whose features and vertices are cached: drags and Resolve return to them."""
 
 _LEAST_VARIANCE = 0.02
-"""Of the mean variance of the training codes: few poses leave most directions without any."""
+"""Least variance, as a share of the training codes' mean variance: few poses leave most directions
+without any."""
 
 
 class PosesOnGpu(Protocol):
-    """What decodes codes on a GPU, at most so many poses at once."""
+    """A decoder of codes on a GPU, for at most `at_once` poses at a time."""
 
     at_once: int
 
     def decode(self, codes: npt.NDArray[Any]) -> Any:
-        """Decode (B, D) codes to (B, V, 3) float32 vertices there, in the data's unit."""
+        """Decode (B, D) codes to (B, V, 3) float32 vertices on the GPU, in the data's unit."""
 
 
 class PoseSpace(Protocol):
-    """Poses of one mesh as vectors of D numbers, the codes, that belong to K body parts.
+    """Poses of one mesh as vectors of D codes, which belong to K body parts.
 
-    Lengths are normalised, and vertices lie in the model's frame. All of it may be shared between
-    threads.
+    Lengths are normalised, and vertices are in model coordinates. Threads may share a space.
     """
 
     @property
@@ -69,11 +69,11 @@ class PoseSpace(Protocol):
 
     @property
     def group_sizes(self) -> tuple[int, ...]:
-        """How many codes each group has; groups follow each other, and shapes follow them."""
+        """Number of codes of each group; the codes are the groups in turn, then the shapes."""
 
     @property
     def n_shapes(self) -> int:
-        """S, how many codes, the last, shape a face or the like: solvers leave them as posed."""
+        """S, the number of shape codes, which come last; solvers leave them as posed."""
 
     @property
     def n_domains(self) -> int:
@@ -81,7 +81,7 @@ class PoseSpace(Protocol):
 
     @property
     def vertex_domain(self) -> npt.NDArray[np.intp]:
-        """(V,) the body part that leads each vertex, from 0."""
+        """(V,) the leading body part of each vertex, from 0."""
 
     @property
     def metric(self) -> FloatArray:
@@ -92,7 +92,7 @@ class PoseSpace(Protocol):
 
     @property
     def domain_metrics(self) -> DisplacementMetrics:
-        """What the vertices that each of the K body parts leads add to the metric."""
+        """Contributions to the metric of the vertices that each of the K body parts leads."""
 
     @property
     def precision(self) -> FloatArray:
@@ -100,18 +100,18 @@ class PoseSpace(Protocol):
 
     @property
     def longest_edges(self) -> FloatArray:
-        """(E,) float64 array: how long each of the topology's edges gets in plausible poses."""
+        """(E,) float64 array, the longest length of each edge in plausible poses."""
 
     @property
     def surface_graph(self) -> csr_matrix:
         """(V, V) lengths of the edges on the reference, for distances along the surface."""
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
-        """Return which codes body parts own: (D,)."""
+        """Return (D,) whether each code belongs to one of the body parts."""
 
     @property
     def limbs(self) -> Limbs:
-        """The tree of what moves by itself."""
+        """The tree of segments that move by themselves."""
 
     def price(self, moved: FloatArray, held: Set[int], whole_body: bool) -> FloatArray:
         """Return the (D, D) price of a change of the codes since a drag began.
@@ -119,30 +119,30 @@ class PoseSpace(Protocol):
         Parameters
         ----------
         moved : (D,) the change
-        held : segments of `limbs`, of the limb that is held and of pinned ones
-        whole_body : the others are to help readily, not only where nothing else does
+        held : segments of `limbs`, of the held limb and of pinned ones
+        whole_body : whether the other segments help readily, not only as a last resort
         """
 
     def shifted(self, codes: FloatArray, way: FloatArray) -> FloatArray:
-        """Move the whole body of (D,) codes by a (3,) way; the same where it has no own place."""
+        """Shift the whole body of (D,) codes by a (3,) vector, if its codes hold a position."""
 
     def decode(self, codes: FloatArray) -> FloatArray:
-        """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread.
+        """Decode (B, D) codes to (B, V, 3) vertices, on the calling thread.
 
-        They may be kept for the next call, so nobody may write into them.
+        They may be cached for the next call, so callers must not write into them.
         """
 
     def gpu_decoder(self, body_size: float) -> PosesOnGpu | None:
-        """Return what decodes on a GPU, to lengths in the data's unit; None where nothing does.
+        """Return a decoder on a GPU, to lengths in the data's unit; None if there is none.
 
-        The poses have no shapes there.
+        Its poses have no shapes.
         """
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
-        """Turn (B, D) codes into the (B, n, 3) vertices of (n,) numbers, quicker where it can."""
+        """Decode (B, D) codes to the (B, n, 3) vertices of (n,) indices, faster if possible."""
 
     def shaped_as(self, codes: FloatArray, vertices: FloatArray) -> PoseSpace:
-        """Return the same poses of a body so shaped that (D,) codes have given (V, 3) vertices."""
+        """Return the space of a body shaped so that (D,) codes decode to given (V, 3) vertices."""
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
@@ -156,9 +156,9 @@ class PoseSpace(Protocol):
 
         Returns
         -------
-        slopes : called with the (D,) codes of a pose and (n, V, 3) further derivatives by its
-            vertices (n may be 0), returns (3 m + n, D) derivatives by its codes: rows 3 k + a are
-            coordinate a of the mean of patch k; the last n are `pull_back` of the further ones
+        slopes : takes the (D,) codes of a pose and n further (n, V, 3) derivatives by its vertices
+            (n may be 0); returns (3 m + n, D) derivatives by its codes: row 3 k + a is that of
+            coordinate a of patch k's mean; the last n are `pull_back` of the further ones
         """
 
 
@@ -167,7 +167,7 @@ class LatentPoseSpace:
 
     Parameters
     ----------
-    embedding : decodes
+    embedding : decodes the poses
     """
 
     n_shapes = 0
@@ -178,7 +178,7 @@ class LatentPoseSpace:
         self.low, self.high = embedding.box.low, embedding.box.high
         self.group_sizes, self.n_domains = embedding.group_sizes, embedding.n_domains
         self.vertex_domain = embedding.attention_mask.argmax(axis=0)
-        # Not of a method, which would keep the space and the embedding alive.
+        # A cache of a method would keep the space and the embedding alive.
         remember = lru_cache(maxsize=_REMEMBERED_POSES)
         self._remembered = remember(partial(_features_and_vertices, embedding))
         self._detail: FloatArray | None = None
@@ -189,7 +189,7 @@ class LatentPoseSpace:
     def domain_metrics(self) -> DisplacementMetrics:
         """J_k^T J_k / V of the decoder's Jacobian, averaged over evenly spaced training poses.
 
-        J_k has the rows of the vertices that domain k leads.
+        J_k holds the rows of the vertices that domain k leads.
         """
         if self._origin is not None:
             return self._origin.domain_metrics
@@ -210,12 +210,12 @@ class LatentPoseSpace:
 
     @property
     def metric(self) -> FloatArray:
-        """The sum of `domain_metrics`, with a little more on the diagonal."""
+        """The sum of `domain_metrics`, with a small addition on the diagonal."""
         return self.domain_metrics.definite
 
     @cached_property
     def precision(self) -> FloatArray:
-        """The inverse covariance of the training poses' codes, shrunk towards a multiple of 1."""
+        """The inverse covariance of the training codes, shrunk towards a multiple of identity."""
         latent = self.embedding.training_latent.astype(np.float64)
         covariance = latent.T @ latent / len(latent)
         shrunk = _LEAST_VARIANCE * float(covariance.trace()) / len(covariance)
@@ -223,7 +223,7 @@ class LatentPoseSpace:
 
     @cached_property
     def longest_edges(self) -> FloatArray:
-        """(E,) float64 array: the length of each edge in the training pose where it is longest."""
+        """(E,) float64 array, the longest length of each edge in the training poses."""
         if self._origin is not None and self._shown is not None:
             own = self.topology.edge_lengths(self._shown)
             return np.maximum(self._origin.longest_edges, own)
@@ -239,7 +239,7 @@ class LatentPoseSpace:
         return length_graph(self.topology.edges, self.rest_vertices)
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
-        """Return which codes belong to domains: (D,); see `Embedding.codes_of`."""
+        """Return (D,) whether each code belongs to the domains; see `Embedding.codes_of`."""
         return self.embedding.codes_of(domains)
 
     @cached_property
@@ -254,7 +254,7 @@ class LatentPoseSpace:
         root = int(np.where(np.isfinite(steps), steps, self.n_domains).sum(axis=1).argmin())
         nearer = steps[root][None, :] < steps[root][:, None]
         parents = np.where(nearer, borders, -1.0).argmax(axis=1)
-        # What touches nothing hangs on the middle too.
+        # Domains without neighbours hang on the middle one too.
         parents[~np.isfinite(steps[root])] = root
         parents[root] = -1
         n_children = np.bincount(parents[parents >= 0], minlength=self.n_domains)
@@ -275,7 +275,7 @@ class LatentPoseSpace:
     def price(self, moved: FloatArray, held: Set[int], whole_body: bool) -> FloatArray:
         """Price the mean squared displacement, part by part; see `PoseSpace.price`.
 
-        A part that has moved far costs less for each further step, so that few parts move:
+        The farther a part has moved, the less each further step costs, so that few parts move:
         reweighted least squares, as for the group lasso (Yuan and Lin 2006).
         """
         metrics, limbs = self.domain_metrics, self.limbs
@@ -287,7 +287,7 @@ class LatentPoseSpace:
         return metrics.weighted(factor * _HOLD / (1.0 + np.sqrt(np.maximum(squared, 0.0)) / _MOVED))
 
     def shifted(self, codes: FloatArray, way: FloatArray) -> FloatArray:  # noqa: ARG002
-        """Return the codes: a latent pose has no place of its own."""
+        """Return the codes unchanged: a latent pose holds no position."""
         return codes
 
     def decode(self, codes: FloatArray) -> FloatArray:
@@ -307,7 +307,7 @@ class LatentPoseSpace:
         return GpuDecoder(self.embedding, body_size)
 
     def shaped_as(self, codes: FloatArray, vertices: FloatArray) -> LatentPoseSpace:
-        """Return the same poses with a detail that lies still in the model's frame."""
+        """Return the same poses with a detail added that is fixed in model coordinates."""
         shaped = copy(self)
         shaped.__dict__.pop("longest_edges", None)
         shaped._origin = self._origin or self
@@ -315,7 +315,7 @@ class LatentPoseSpace:
         return shaped
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
-        """Decode (B, D) latent poses to (B, n, 3) vertices, which takes as long as all of them."""
+        """Decode (B, D) latent poses to (B, n, 3) vertices, in the time of all vertices."""
         return np.stack([self.decode(pose[None])[0, chosen] for pose in codes])
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
@@ -325,7 +325,7 @@ class LatentPoseSpace:
         return self.embedding.decoder.pull_back(codes, by_features)
 
     def mean_slopes(self, weights: csr_matrix) -> MeanSlopes:
-        """Solve for patches' means once; see `PoseSpace.mean_slopes`."""
+        """Solve once for the patches' means; see `PoseSpace.mean_slopes`."""
         codec, decoder = self.embedding.codec, self.embedding.decoder
         by_gradients = codec.means_by_gradients(weights)
 
@@ -336,13 +336,13 @@ class LatentPoseSpace:
         return slopes
 
     def _at(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the (V, 9) features and (V, 3) vertices of (D,) codes, to be read only."""
+        """Return the read-only (V, 9) features and (V, 3) vertices of (D,) codes."""
         return self._remembered(np.asarray(codes, dtype=np.float64).tobytes())
 
 
 def _features_and_vertices(embedding: Embedding, codes: bytes) -> tuple[FloatArray, FloatArray]:
     """Decode the bytes of (D,) float64 codes."""
-    # Writable, as compiled loops would be compiled again for arrays that are not.
+    # Keep the arrays writable: Numba would compile its loops again for read-only ones.
     features = embedding.decoder.features(np.frombuffer(codes)[None])
     return features[0], embedding.codec.decode(features, n_threads=1)[0]
 
@@ -351,11 +351,11 @@ _END = 0.8
 """Share of a part's vertices that lie before its far end."""
 
 _FRAME = 0.15
-"""Normalised: a foot is about so long."""
+"""Normalised radius of a frame, about the length of a foot."""
 
 
 def long_axis(points: npt.NDArray[np.floating]) -> FloatArray:
-    """Return the direction in which (n, 3) points spread most, of length 1.
+    """Return the unit direction in which (n, 3) points spread most.
 
     Its largest component is positive, so that it does not depend on rounding.
     """
@@ -372,7 +372,7 @@ def far_end(space: PoseSpace, domain: int) -> int:
 
     Parameters
     ----------
-    space : of the poses; the end is that of the reference
+    space : of the poses; the end is found on the reference
     domain : index from 0
     """
     inside = _without_fingers(space, domain)
@@ -393,7 +393,7 @@ def frame_round(space: PoseSpace, vertex: int) -> list[int]:
 
     Parameters
     ----------
-    space : of the poses; distances are those of the reference
+    space : of the poses; distances are measured on the reference
     vertex : index from 0
     """
     inside = _without_fingers(space, int(space.vertex_domain[vertex]))
