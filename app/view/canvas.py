@@ -438,8 +438,8 @@ def handles_of(space: PoseSpace) -> list[Handle]:
 class Mouse(QObject):
     """Turn mouse events of a canvas into drags of the body and of the camera.
 
-    The left button on the body drags the patch under the pointer in the image plane, or along the
-    surface of what is in front; the wheel then changes its depth. Ctrl twists the body part, and
+    The left button on the body drags the patch under the pointer in the image plane, or over a
+    surface in front of it; the wheel then changes its depth. Ctrl twists the body part, and
     Ctrl+Shift lets the whole body help. An arrow is dragged along its axis. The left button beside
     the body, the middle button or Alt turns the camera; Shift shifts it. The right button, moved
     up or down, zooms like the wheel.

@@ -40,7 +40,7 @@ UNIT = "in % of the body size"
 
 
 class Shading(Enum):
-    """What the colours of the mesh show; the value is the title of the legend."""
+    """Shading modes of the mesh; the value is the title of the legend."""
 
     TEXTURED = "Textured"
     PLAIN = "Plain"
