@@ -1,4 +1,4 @@
-"""Check files for self-collisions: a mesh, or every frame of the clips of a file."""
+"""Check files for self-collisions: meshes, or every frame of the clips of a file."""
 
 from __future__ import annotations
 
@@ -43,27 +43,27 @@ if TYPE_CHECKING:
     from lcollision_core.motion import Motion, ScreenedMotion
 
 _DEEPEST = 100
-"""Most pairs of faces that are listed one by one."""
+"""Most pairs of faces that are listed individually."""
 
 
 @dataclass(frozen=True)
 class CheckRequest:
-    """How files are to be checked.
+    """How to check files.
 
     Attributes
     ----------
-    rules : added to those of the file, or to none
-    rest : a file with the rest pose; None for that of the file itself
-    no_rules : whether all pairs count but those of `rules`
-    clearance : faces that are nearer count as colliding, normalised
-    touch : "A:B" of groups that may touch all the same
-    motion : which clip of a file, and its frames
-    body : a character's file or a model's name, whose poses a motion's are; None where the file has
-        a body of its own
-    error_bound : share of wrong verdicts, measured on samples of a learned body's latent box, up to
-        which its estimate may stand for the check of free frames
-    scene : what stands beside the mesh, or moves beside the character
-    joints : a file that says which joint of the body follows which of a motion's: see `following`
+    rules : changes to the rules of the file, or to none
+    rest : a file with the rest pose; None for the file's own
+    no_rules : whether to count all pairs except by `rules`
+    clearance : normalised distance below which faces count as colliding
+    touch : entries "A:B" of groups that may touch regardless
+    motion : which clip of a file, and which frames
+    body : a character's file or a model's name, which a motion moves; None if the file has its
+        own body
+    error_bound : largest share of wrong verdicts, measured on samples of a learned body's latent
+        box, for which the estimate may replace the check of free frames
+    scene : other bodies beside the mesh or the character
+    joints : a file that matches the body's joints to a motion's: see `following`
     """
 
     rules: RuleOptions = field(default_factory=RuleOptions)
@@ -79,11 +79,11 @@ class CheckRequest:
 
     @cached_property
     def rest_mesh(self) -> Mesh | None:
-        """The rest pose of meshes; None where none is given.
+        """The rest pose of meshes; None if none is given.
 
         Raises
         ------
-        LCollisionError : it cannot be read, or is missing where the rules need it.
+        LCollisionError : it cannot be read, or is missing although the rules need it.
         """
         if self.rest is not None:
             return read_mesh(self.rest)
@@ -94,11 +94,11 @@ class CheckRequest:
 
 
 def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> CheckedMesh:
-    """Check one mesh, by the contact rules of its character where that is known.
+    """Check one mesh, by the contact rules of its character if known.
 
     Raises
     ------
-    LCollisionError : the file cannot be read, or does not have the faces of the rest pose.
+    LCollisionError : the file cannot be read, or its faces differ from the rest pose's.
     CancelledError : the job was cancelled.
     """
     from lcollision_core.bodies import MeshBody
@@ -146,7 +146,7 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
 
 
 def _check_scene(path: Path, request: CheckRequest, job: Job) -> CheckedMesh:
-    """Check meshes as they stand in a scene, each by the rules of its own character."""
+    """Check meshes placed in a scene, each by the rules of its own character."""
     from lcollision_core.bodies import MeshBody, open_body
     from lcollision_core.bodies.scene_file import body_of_scene
 
@@ -191,7 +191,7 @@ def _checked(
     request: CheckRequest,
     start: float,
 ) -> CheckedMesh:
-    """Return the verdict of a mesh that was begun to be checked at a time."""
+    """Return the verdict of a mesh, with the time since `start`."""
     deepest = zip(collisions.pairs.tolist(), collisions.penetration_depth.tolist(), strict=True)
     return CheckedMesh(
         file=file,
@@ -218,11 +218,11 @@ def _checked(
 
 
 def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list[CheckedClip]:
-    """Check every frame of the clips of one file, and the poses between them.
+    """Check every frame of the clips of a file, and the poses between them.
 
     Raises
     ------
-    LCollisionError : the file cannot be read, has no clip, or has a body with a rest pose.
+    LCollisionError : the file cannot be read, has no clip, or needs no `rest`.
     CancelledError : the job was cancelled.
     """
     from lcollision_core.bodies import open_body
@@ -248,7 +248,7 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
 
 
 def _check_poses(body: Body, path: Path, request: CheckRequest, job: Job) -> list[CheckedClip]:
-    """Check motions of a body's own poses."""
+    """Check motions of a body's poses."""
     from lcollision_core.bodies.motions import read_motions
 
     if request.rest is not None:
@@ -299,7 +299,7 @@ def _check_motions(
 
 
 def _check_meshes(path: Path, request: CheckRequest, job: Job) -> list[CheckedClip]:
-    """Check a file whose frames are meshes: without a rig, by components."""
+    """Check a file whose frames are meshes; without a rig, parts are components."""
     from lcollision_core.bodies import MeshBody
     from lcollision_core.bodies.motions import is_of_skeleton
     from lcollision_core.motion import NOMINAL_RATE, screen_frames
@@ -410,9 +410,9 @@ def _verdict(
 
 
 def table_of(verdicts: Iterable[CheckedClip]) -> str:
-    """Return a CSV table with a row for each frame that has pairs; depths are in body sizes.
+    """Return a CSV table with a row for each frame with pairs; depths are in body sizes.
 
-    A frame that is free has 0 pairs in it, beside those that contact rules leave out.
+    A free frame with excluded pairs has 0 pairs.
     """
     names = [column.name for column in fields(CheckedFrame)]
     table = io.StringIO()
@@ -430,7 +430,7 @@ def table_of(verdicts: Iterable[CheckedClip]) -> str:
 
 
 def with_rest(options: RuleOptions) -> RuleOptions:
-    """Return the options of a mesh with a rest pose: what touches there does not count."""
+    """Return options for a mesh with a rest pose: contacts at rest are excluded by default."""
     if options.rest_exclusion is not None:
         return options
     return replace(options, rest_exclusion=CHARACTER_REST_EXCLUSION)
@@ -447,7 +447,7 @@ def _as_asked(body: _AnyBody, request: CheckRequest) -> _AnyBody:
 
 
 def _groups(path: Path, topology: Topology, request: CheckRequest) -> tuple[FaceGroup, ...]:
-    """Return the meshes and materials that a file of a scene names, if its faces are these."""
+    """Return the meshes and materials named in a scene's file, if its faces match."""
     from lcollision_core.files.scene.joined import join_parts
 
     is_asked = request.rules.name_groups or request.touch
@@ -458,7 +458,7 @@ def _groups(path: Path, topology: Topology, request: CheckRequest) -> tuple[Face
 
 
 def _known(path: Path, mesh: Mesh, job: Job) -> tuple[RigBody, npt.NDArray[np.float64]] | None:
-    """Return the character of a mesh file, with its rules, and the pose; None for none."""
+    """Return the character of a mesh file, with its rules, and the pose; None if there is none."""
     from lcollision_core.bodies import character_of_mesh
 
     try:

@@ -1,4 +1,4 @@
-"""Write poses, meshes and motions, by the form of the output, and check what was written."""
+"""Write poses, meshes and motions in the form of the output, and check the written files."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class Output:
 
     Attributes
     ----------
-    path : as it was named
+    path : as named by the user
     form : of the output
-    before : what was there when the command began, by `file_stamp`
+    before : stamp of an existing file when the command began, by `file_stamp`
     """
 
     path: Path
@@ -53,13 +53,13 @@ class Output:
 
 
 def suffix_of(output: Output, model: Body, request: ExportRequest) -> str:
-    """Return the extension of the files that an output of meshes of a model gets."""
+    """Return the extension of the mesh files of an output."""
     from lcollision_core.files.table import SCENE_SUFFIXES
 
     if output.form != "folder":
         return output.path.suffix.lower()
     like = request.like
-    # A GLB file has axes and a unit of its own.
+    # A GLB file has its own axes and unit.
     is_as_stored = request.axes == ExportAxes.MODEL and request.scale is None
     if like is None and is_as_stored:
         like = model.own_file
@@ -68,11 +68,11 @@ def suffix_of(output: Output, model: Body, request: ExportRequest) -> str:
 
 
 def require_output(path: Path, suffix: str) -> Output:
-    """Refuse an output that is not one file of a format, before the work for it is done.
+    """Raise early unless an output is one writable file of a format.
 
     Raises
     ------
-    LCollisionError : another extension, or the file could not be written.
+    LCollisionError : another extension, or the file cannot be written.
     """
     if path.suffix.lower() != suffix:
         raise LCollisionError.unwritable(path, f"it must be a {suffix} file", "rename it")
@@ -81,20 +81,19 @@ def require_output(path: Path, suffix: str) -> Output:
 
 
 def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = False) -> Output:
-    """Determine the form of an output, before the work for it is done.
+    """Determine the form of an output, before any work for it.
 
-    An existing folder and what ends in a slash are folders whatever they are called; else the
-    extension decides. A name without one, or with what is no kind of file, as in "results_v0.9",
-    is a folder to be created.
+    Existing folders and names that end in a slash are folders; otherwise the extension decides.
+    A name without a known extension, as in "results_v0.9", is a folder to be created.
 
     Raises
     ------
-    LCollisionError : the extension is of files that are not written here, or the file or folder
-        could not be written.
+    LCollisionError : the extension is not a supported output, or the file or folder cannot be
+        written.
     """
     path = Path(name)
     suffix = path.suffix.lower()
-    if os.path.isdir(name):  # noqa: PTH112 - a name that is too long is none, and no error
+    if os.path.isdir(name):  # noqa: PTH112 - returns False for names that are too long
         require_writable(path / "pose.obj")
         return Output(path, "folder", None)
     must_be_folder = name.endswith(("/", os.sep))
@@ -128,13 +127,13 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
 def refuse_to_replace(
     outputs: Iterable[Path], sources: Iterable[Path], *, in_place: bool = False
 ) -> None:
-    """Refuse outputs that are inputs, before the work for them is done.
+    """Raise early if an output would replace an input.
 
     Parameters
     ----------
-    outputs : files that are to be written
+    outputs : files to be written
     sources : files that the command reads
-    in_place : whether the user wants that
+    in_place : whether the user allows it
 
     Raises
     ------
@@ -161,7 +160,7 @@ def _status(path: Path) -> os.stat_result | None:
 
 
 def source_files(model: Body, request: ExportRequest | None = None) -> list[Path]:
-    """Return the user's own files that a body, and the form of its meshes, come from."""
+    """Return the user's files that a body, and the form of its exports, come from."""
     from lcollision_core.bodies import as_scene
 
     own, scene = [None if request is None else request.like, model.own_file], as_scene(model)
@@ -174,7 +173,7 @@ def source_files(model: Body, request: ExportRequest | None = None) -> list[Path
 def files_of(
     output: Output, model: Body, poses: Sequence[NamedPose], request: ExportRequest
 ) -> list[Path]:
-    """Return the files that `write_result` makes of some poses, those of frames apart."""
+    """Return the files that `write_result` writes for some poses, except for frames."""
     from lcollision_core.bodies import as_scene
 
     if output.form != "folder":
@@ -189,11 +188,11 @@ def files_of(
 
 
 def require_one_mesh(output: Output, n_poses: int) -> None:
-    """Refuse to write any other number of poses than one as one mesh.
+    """Raise if a single mesh file is to hold another number of poses than one.
 
     Raises
     ------
-    LCollisionError : they are not one.
+    LCollisionError : the number is not one.
     """
     if output.form == "mesh" and n_poses != 1:
         raise LCollisionError(
@@ -202,11 +201,11 @@ def require_one_mesh(output: Output, n_poses: int) -> None:
 
 
 def require_codes_alone(output: Output, request: ExportRequest) -> None:
-    """Refuse options of meshes where the output holds codes.
+    """Raise if mesh options are given for an output of codes.
 
     Raises
     ------
-    LCollisionError : one is given.
+    LCollisionError : an option is given.
     """
     for_any = ExportRequest(mesh_format=request.mesh_format, fps=request.fps)
     if output.form == "poses" and request != for_any:
@@ -221,18 +220,18 @@ def require_codes_alone(output: Output, request: ExportRequest) -> None:
 def require_request(
     output: Output, model: Body, poses: Sequence[NamedPose], request: ExportRequest
 ) -> SourceFile | None:
-    """Refuse a request that the output or the poses cannot have, before the work for it is done.
+    """Raise early if a request does not suit the output or the poses.
 
     Returns
     -------
-    the user's file whose form the output keeps, None for none
+    the source file whose form the output keeps, or None
 
     Raises
     ------
-    MeshFileError : the format's rounding steps where a pose lies exceed a small fraction of an
-        edge, or the file of `like` cannot be read, is of another body or does not offer the form.
-    PoseSetError : the file of `like` is of another body.
-    LCollisionError : the output holds codes.
+    MeshFileError : the format's precision is too low at a pose's position, or the file of `like`
+        cannot be read, belongs to another body or does not offer the form.
+    PoseSetError : the file of `like` belongs to another body.
+    LCollisionError : mesh options are given for an output of codes.
     """
     from lcollision_core.bodies import requested_form, source_for
 
@@ -262,29 +261,29 @@ def write_result(
     keeps_meshes: bool = True,
     job: Job = UNWATCHED,
 ) -> Sequence[WrittenPose]:
-    """Write poses as a .json file, meshes or frames, and note so.
+    """Write poses as a .json file, meshes or frames, and note it.
 
-    One pose is a mesh, several are meshes in a folder: all of them come there, or none. A file
-    that others have written since the command began stays, and the poses go beside it.
+    One pose is a mesh; several are meshes in a folder, written atomically. A file changed by
+    another command in the meantime stays, and the result gets another name.
 
     Parameters
     ----------
-    output : a folder is made where there is none
+    output : a folder is created if necessary
     model : of the poses
-    poses : a pose with a placement returns to it
+    poses : placed poses are written at their placement
     request : of meshes
-    vertices : of each pose, (V, 3) to write; what the poses decode to where None
-    source : the user's file whose form is kept, by `require_request`
-    keeps_meshes : whether the result holds the vertices of files of one mesh each
+    vertices : (V, 3) of each pose; by default the decoded poses
+    source : the source file whose form is kept, by `require_request`
+    keeps_meshes : whether the result includes vertices of single mesh files
     job : takes the notes
 
     Returns
     -------
-    written : of each pose; one file may have several
+    written : one for each pose; several may share a file
 
     Raises
     ------
-    LCollisionError : several poses and one mesh file, or a file or folder cannot be written.
+    LCollisionError : several poses go to one mesh file, or a file or folder cannot be written.
     """
     from lcollision_core.bodies import (
         WrittenPose,
@@ -349,7 +348,7 @@ def write_result(
                 job.note(say("wrote {file}", file=file))
         else:
             meshes = write([path])
-    # The frames of one file have the same notes.
+    # Frames of one file share their notes.
     one_each = meshes[:1] if output.form == "frames" else meshes
     _note_written(path, len(poses), n_replaced, one_each, job)
     _remember(model, output, job)
@@ -357,7 +356,7 @@ def write_result(
 
 
 def _remember(model: Body, output: Output, job: Job) -> None:
-    """Keep where a character is whose meshes were written, so that `check` knows them."""
+    """Remember the file of a character whose meshes were written, so that `check` knows it."""
     from lcollision_core.bodies import remember_file
 
     if model.own_file is not None and output.form != "poses":
@@ -396,11 +395,10 @@ def export(
     _: Job,
     own: Callable[[], PoseSpace] | None = None,
 ) -> str:
-    """Write the mesh that is drawn of a pose, moved back to where it came from, and check it.
+    """Write the displayed mesh of a pose, at its placement, and check the file.
 
-    A pose that Resolve ended in is written with the vertices of its `outcome`, any other frame of
-    a motion with the body as it is then, `own`. The check is of what the file holds.
-    Returns a sentence for the status bar.
+    The result of Resolve is written with the vertices of its `outcome`; other frames of a motion
+    use the body in that frame, `own`. Returns a sentence for the status bar.
     """
     from lcollision_core.bodies import source_for, write_pose
 
@@ -427,7 +425,7 @@ def export(
 def frame_files(
     model: Body, path: Path, request: ExportRequest, _: Job
 ) -> tuple[list[Path], SourceFile | None]:
-    """Return what `export_frames` writes, a file for each mesh of the user's file, and that."""
+    """Return the files that `export_frames` writes, one per mesh of the source file, and that."""
     from lcollision_core.bodies import sequence_files, source_for
 
     source = source_for(path.suffix, model, request.like)
@@ -442,9 +440,9 @@ def export_frames(
     job: Job,
     source: SourceFile | None = None,
 ) -> str:
-    """Write a motion as the frames of `frame_files`, where each lies, and check each.
+    """Write a motion as frames to `frame_files`, each at its placement, and check each.
 
-    The user's file, `source`, is read if it was not. Returns a sentence for the status bar.
+    By default, `source` is read from the user's file. Returns a sentence for the status bar.
     """
     from lcollision_core.bodies import source_for, write_sequence
 
@@ -480,12 +478,12 @@ def export_clips(
     path: Path,
     _: Job,
 ) -> str:
-    """Write the character's own file with its changed clips, whose frames are checked.
+    """Write the character's file with changed clips, and check their frames.
 
     Parameters
     ----------
     file : that the motions were read from
-    changes : of each changed clip, as it was read and as it is now
+    changes : for each changed clip, the motion as read and as it is now
 
     Returns
     -------

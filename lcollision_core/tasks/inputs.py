@@ -93,7 +93,7 @@ def motion_files_of(inputs: Iterable[Path], job: Job = UNWATCHED) -> list[Path]:
 def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None) -> list[Path]:
     """Return the motion files in a folder and its subfolders, in natural order.
 
-    Empty if the folder holds meshes. Scenes count if they have clips. Body models, and further
+    Empty if it holds only meshes. Scenes count if they have clips. Body models, and further
     files that motion generators write, are skipped with a note.
 
     Parameters

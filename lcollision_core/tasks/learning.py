@@ -1,4 +1,4 @@
-"""One run from files to a trained body, which goes on however it was stopped."""
+"""Learn a model from files in one resumable run."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Effort:
-    """What a quality spends.
+    """Training effort of a quality setting.
 
     Attributes
     ----------
-    n_poses : that a rig is to have, with the frames of its clips
-    embedding : how the latent space is trained
-    n_samples : mixed samples to label
-    predictor : how the predictor is trained
-    n_judged : poses of each kind that it is measured on
+    n_poses : number of poses for a rig, including the frames of its clips
+    embedding : training of the latent space
+    n_samples : number of mixed samples to label
+    predictor : training of the predictor
+    n_judged : number of poses of each kind for scoring it
     """
 
     n_poses: int
@@ -60,22 +60,22 @@ class Effort:
 
 
 EFFORTS = {
-    # Level 2 stays as the principal components of what level 1 leaves, and nothing is held out.
+    # Level 2 stays at the principal components of level 1's residual; nothing is held out.
     Quality.QUICK: Effort(
         100, EmbeddingConfig(level2_epochs=0, held_out_stride=0), 20_000, PRESETS["default"], 200
     ),
     Quality.GOOD: Effort(150, EmbeddingConfig(), 50_000, PRESETS["default"]),
-    # As many as it takes for their held-out rows to choose the decision threshold.
+    # Enough for the held-out rows to determine the decision threshold.
     Quality.BEST: Effort(300, EmbeddingConfig(level2_epochs=60), 340_000, PRESETS["default"]),
 }
 
 
 _TRAINING_SHARE = 1.0 - 0.3 * BOX_ROWS / ROWS_PER_BLOCK
-"""Fraction of the labelled samples that train the predictor."""
+"""Share of the labelled samples that train the predictor."""
 
 
 _FOLDED = 3000
-"""Colliding samples in which folds are searched for."""
+"""Number of colliding samples that are searched for folds."""
 
 
 def estimated_seconds(
@@ -91,12 +91,12 @@ def estimated_seconds(
 
     Parameters
     ----------
-    n_vertices, n_poses : of the poses to learn from
+    n_vertices, n_poses : of the training poses
     quality : of the model
-    n_cores : that are used, by default those that there are
-    row_seconds : what a sample has taken to decode and check, on all cores, which layers of clothes
-        make several times as much; None estimates it by the vertices
-    colliding_share : of the samples, which alone are checked again for the predictor
+    n_cores : number of cores, by default all available
+    row_seconds : measured seconds to decode and check a sample, on all cores; layers of clothes
+        multiply it. By default it is estimated by the vertices.
+    colliding_share : share of colliding samples; only these are checked again for the predictor
 
     Returns
     -------
@@ -124,7 +124,7 @@ def estimated_seconds(
 
 
 def _latent_space(effort: Effort, share: float) -> float:
-    """Return the seconds of stage 1 for each vertex of each pose; codes are fitted on threads."""
+    """Return the seconds of stage 1 per vertex and pose; codes are fitted on threads."""
     config = effort.embedding
     n_codes = config.n_domains * (1 + config.n_domain_codes)
     micros = 9.0 + 0.45 * config.level1_epochs + 2.3 * config.level2_epochs
@@ -136,17 +136,17 @@ def _latent_space(effort: Effort, share: float) -> float:
 
 
 _TRUSTED_SECONDS = 30.0
-"""Of estimated work, as much as which the estimate counts beside the pace of the run."""
+"""Weight of the estimate against the run's measured pace, in seconds of work."""
 
 _TELLING = 0.05
-"""Fraction of a stage from which its own pace is known."""
+"""Share of a stage after which its own pace is used."""
 
 _FIRST = 2
-"""Reports of a stage that tell where it begins, not how fast it is."""
+"""Number of first reports of a stage that determine its start, not its pace."""
 
 
 class Pace:
-    """Turns the progress of single stages into that of the run, and measures its pace.
+    """Combines the progress of stages into that of the run, and measures its pace.
 
     Parameters
     ----------
@@ -164,15 +164,15 @@ class Pace:
         self._entered, self._entered_at = self._began, 0.0
 
     def expect(self, seconds: Mapping[Stage, float]) -> None:
-        """Take better estimates once the poses are known; the pace begins anew."""
+        """Replace the estimates once the poses are known, and restart the pace."""
         self._expected = seconds
         self._began = time.monotonic()
         self._behind = self._skipped = self._seconds_behind(self._stage, 1.0)
 
     def tell(self, stage: Stage, stage_done: float, facts: Sequence[str] = ()) -> None:
-        """Report a fraction of a stage.
+        """Report progress within a stage.
 
-        What is done at once when a stage begins was done by an earlier process.
+        Progress in the first reports of a stage was made by an earlier process.
         """
         if stage is not self._stage:
             self._stage, self._n_told = stage, 0
@@ -187,12 +187,12 @@ class Pace:
         pace = (_TRUSTED_SECONDS + seconds) / (_TRUSTED_SECONDS + max(worked, 0.0))
         done_here = stage_done - self._entered_at
         if done_here > _TELLING:
-            # How fast the stage is says more of it than how fast those before were.
+            # The stage's own pace predicts it better than that of earlier stages.
             here = (now - self._entered) * (1.0 - stage_done) / done_here
         else:
             here = (1.0 - stage_done) * self._expected[stage] * pace
         left = here + (total - self._seconds_behind(stage, 1.0)) * pace
-        # Better estimates never take back what was shown.
+        # The displayed progress never goes back.
         self._shown = max(self._shown, behind / total)
         status = LearningStatus(
             RunState.RUNNING, stage, stage_done, self._shown, left, tuple(facts)
@@ -200,30 +200,30 @@ class Pace:
         self._report(status)
 
     def _seconds_behind(self, stage: Stage, stage_done: float) -> float:
-        """Return the estimated seconds of what is done."""
+        """Return the estimated seconds of finished work."""
         before = sum(self._expected[earlier] for earlier in STAGES[: STAGES.index(stage)])
         return before + stage_done * self._expected[stage]
 
 
 @dataclass(frozen=True)
 class LearnedCard:
-    """The figures of a learned model.
+    """Key figures of a learned model.
 
     Attributes
     ----------
     model : path of its file
     name : of the model
-    vertices, poses : of what it was learned from
-    parts : body parts
-    error_mean, error_max : of the poses learned from, normalised
-    accuracy, false_positive_rate, false_negative_rate, majority_rate : of the predictor on samples
-        that it has not seen; a rate is None where no sample can tell
-    samples : that were labelled
+    vertices, poses : numbers in the training data
+    parts : number of body parts
+    error_mean, error_max : of the training poses, normalised
+    accuracy, false_positive_rate, false_negative_rate, majority_rate : of the predictor on
+        held-out samples; a rate is None if no sample determines it
+    samples : number of labelled samples
     colliding_share : of the latent box
-    rules : what is not counted, in words; "" where all pairs count
+    rules : description of the contact rules; "" if all pairs count
     seconds : by stage
-    notes : sentences on what was changed when the poses were read
-    kinds : scores of the predictor on poses of several kinds
+    notes : sentences about changes made on reading the poses
+    kinds : scores of the predictor on several kinds of poses
     """
 
     model: str
@@ -246,11 +246,11 @@ class LearnedCard:
 
 
 def card_of(model: LearnedBody, path: str) -> LearnedCard:
-    """Return the card of a model that `learn_model` made, from its file.
+    """Return the key figures of a model made by `learn_model`.
 
     Raises
     ------
-    ValueError : it has no predictor, or was not measured.
+    ValueError : it has no predictor, or no scores.
     """
     record, metrics = model.predictor_record, model.embedding.metrics
     if record is None or record.metrics is None or metrics is None:
@@ -279,37 +279,37 @@ def card_of(model: LearnedBody, path: str) -> LearnedCard:
 
 
 _N_SAMPLES, _MOST_COORDINATES = 1024, 40_000_000
-"""Samples that are looked at, of large meshes fewer: 320 MB of coordinates."""
+"""Number of first samples, fewer for large meshes: 320 MB of coordinates."""
 
 _BOX_SCALES = (1.2, 1.1, 1.0)
-"""Multiples of the range of the poses' codes that the box may be; a smaller one would leave some of
-these poses outside."""
+"""Scales of the latent box, as multiples of the range of the poses' codes; a smaller box would
+exclude some of the poses."""
 
 _MANY = 0.8
-"""Share of the samples up to which a box is not made smaller."""
+"""Share of colliding samples up to which the box is kept."""
 
 NEARLY_ALL = 0.95
-"""Share of the samples that collide from which a predictor has next to nothing to learn."""
+"""Share of colliding samples from which a predictor has almost nothing to learn."""
 
 _NAMED_SAMPLES = 64
-"""Samples that tell which parts collide most often."""
+"""Number of samples that determine which parts collide most often."""
 
 _LEAST_BOUND = 1e-5
-"""What is nearer to 0 is the bound of a code that no pose uses, and stays."""
+"""Bounds nearer to 0 belong to codes that no pose uses, and stay."""
 
 
 @dataclass(frozen=True)
 class FirstSamples:
-    """What the first samples of a latent box say.
+    """Statistics of the first samples of a latent box.
 
     Attributes
     ----------
-    n_samples : that were looked at
-    colliding_share : of them
+    n_samples : number of samples
+    colliding_share : share of colliding ones
     box_scale : the box, as a multiple of the range of the poses' codes
-    n_places : pairs of patches that the rules leave out since
-    parts : two that collide most often, by their names; none where few samples collide
-    row_seconds : that one sample takes to decode and check, on all cores
+    n_places : number of pairs of patches that were excluded because of them
+    parts : names of the two parts that collide most often; empty if few samples collide
+    row_seconds : seconds to decode and check a sample, on all cores
     """
 
     n_samples: int
@@ -321,17 +321,17 @@ class FirstSamples:
 
 
 class MostlyCollidingError(LCollisionError):
-    """Nearly all samples collide, so that a predictor would learn next to nothing."""
+    """Nearly all samples collide, so a predictor would learn almost nothing."""
 
     @classmethod
     def of(cls, first: FirstSamples, rig: str, seconds: float) -> MostlyCollidingError:
-        """Make the error of what the first samples say.
+        """Make the error from the first samples.
 
         Parameters
         ----------
         first : the samples
-        rig : the file of a character that can be posed by its joints instead; "" for none
-        seconds : that it would take to go on
+        rig : the file of a character that could be posed by its joints instead; "" for none
+        seconds : estimated time to continue
         """
         where = f", most often {' and '.join(first.parts)}" if first.parts else ""
         instead = f"pose {rig} by its joints, or " if rig else ""
@@ -349,17 +349,17 @@ def look_again(
     request: LearningRequest,
     job: Job = UNWATCHED,
 ) -> tuple[LearnedBody, FirstSamples]:
-    """Give a new latent space the box and the contact rules that its own samples ask for.
+    """Adapt a new latent space's box and contact rules to its first samples.
 
-    Layers that hold their distance in the poses may touch in nearly every sample: patches that do
-    are not counted, unless the request ignores nothing. Where most samples collide all the same,
-    the box is made smaller, down to the range of the poses' codes.
+    Layers that are apart in the poses may touch in nearly every sample: such patches are
+    excluded, unless the request ignores nothing. If most samples still collide, the box is
+    shrunk, down to the range of the poses' codes.
 
     Parameters
     ----------
     model : trained, without predictor
-    request : by which rules and from which seed
-    job : reports (boxes looked at, boxes that there may be); polled between samples
+    request : source of rules and seed
+    job : reports (boxes tried, all boxes); polled between samples
 
     Raises
     ------
@@ -396,7 +396,7 @@ def first_samples(model: LearnedBody, seed: int) -> npt.NDArray[np.float32]:
 
 
 def notes_of(first: FirstSamples) -> list[str]:
-    """Say what was changed because of the first samples."""
+    """Describe the changes made because of the first samples."""
     notes = []
     if first.n_places:
         notes.append(
@@ -429,43 +429,43 @@ def _parts(model: LearnedBody, vertices: npt.NDArray[Any]) -> tuple[str, ...]:
 
 
 _SECONDS_BETWEEN_NOTES = 0.5
-"""Between two notes of the status in the work folder."""
+"""Least time between two status updates in the work folder."""
 
 _VERTICES, _POSES = 10_000, 100
-"""Of a character, until its files are read."""
+"""Assumed size of a character until its files are read."""
 
 _PATCHES, _PASSES = 0.2, 0.8
-"""Fraction of the predictor's stage after which its patches are labelled, and after which it is
-trained; the rest judges kinds of poses."""
+"""Shares of the predictor's stage after which its patches are labelled and its training ends; the
+rest scores kinds of poses."""
 
 _GATHERED = 0.9
-"""Fraction of the stage of the poses after which their contact rules are proposed."""
+"""Share of the pose stage after which contact rules are proposed."""
 
 _TRAINED = 0.9
-"""Fraction of the stage of the latent space after which its first samples are looked at."""
+"""Share of the latent space stage after which its first samples are checked."""
 
 
 def learn_model(work: WorkFolder, job: Job = UNWATCHED) -> LearnedCard:
-    """Do what the request of a work folder asks for, or what is left of it.
+    """Run the request of a work folder, or the rest of it.
 
-    The work folder says at any time how far the run is. At the end it keeps that alone.
+    The work folder always holds the current status. At the end it holds nothing else.
 
     Parameters
     ----------
     work : prepared with a request
-    job : reports each `LearningStatus`; polled often; what is done so far stays in the work folder
+    job : reports each `LearningStatus`; polled often; progress is kept in the work folder
 
     Returns
     -------
-    card : of the model, which is at `card.model`
+    card : of the model, whose file is `card.model`
 
     Raises
     ------
-    ModelFileError : there is a model of that name that did not come of this request, or another
-        process is at it.
-    MostlyCollidingError : nearly all samples collide, and the request is not to go on regardless.
-    LCollisionError : the files cannot be learned from, or the disk is full; the sentence says what
-        is needed, and is kept as the status.
+    ModelFileError : a model of that name exists but was made from another request, or another
+        process is running it.
+    MostlyCollidingError : nearly all samples collide, and the request stops in that case.
+    LCollisionError : the files are unsuitable, or the disk is full; the message is kept in the
+        status.
     CancelledError : the job was cancelled.
     """
     with work.held():
@@ -490,7 +490,7 @@ def learn_latent_space(
     ----------
     name, source, licence : of the body
     poses, config, seed, checkpoint, job : see `train_embedding`
-    facts : more that its file is to say of where it comes from
+    facts : further provenance for its file
 
     Raises
     ------
@@ -525,7 +525,7 @@ def learn_predictor(
     Parameters
     ----------
     body : without a predictor, or with another
-    rows, config, store, checkpoint, seed, device, job : see `train_predictor`
+    body : its predictor, if any, is not used
 
     Raises
     ------
@@ -549,12 +549,12 @@ def learn_predictor(
 
 @dataclass(frozen=True, eq=False)
 class LearnedPredictor:
-    """A predictor that was learned for a body.
+    """A predictor learned for a body.
 
     Attributes
     ----------
-    body : that it was learned for
-    predictor : as it was trained
+    body : the body
+    predictor : the trained predictor
     """
 
     body: LearnedBody
@@ -562,20 +562,20 @@ class LearnedPredictor:
 
     @cached_property
     def free_poses(self) -> npt.NDArray[np.floating]:
-        """The (F, D) poses of the body that are found free, which Resolve falls back to."""
+        """(F, D) collision-free poses of the body, which Resolve can fall back to."""
         from lcollision_core.resolve import find_free_poses
 
         return find_free_poses(self.body.embedding, self.body.exact_check())
 
     def of(self, body: LearnedBody) -> LearnedBody:
-        """Return a body of the same latent space with the predictor and the free poses."""
+        """Return a body of the same latent space with this predictor and the free poses."""
         return body.with_predictor(self.predictor).with_free_poses(self.free_poses)
 
     def judged(self, n_poses: int, seed: int, job: Job = UNWATCHED) -> LearnedPredictor:
-        """Return it with the scores of its predictor on kinds of poses: see `score_kinds`."""
+        """Return a copy with the predictor's scores on kinds of poses: see `score_kinds`."""
         kinds = score_kinds(self.of(self.body), n_poses, seed, job)
         judged = replace(self, predictor=replace(self.predictor, kinds=kinds))
-        # Found once.
+        # Avoid finding them again.
         judged.__dict__["free_poses"] = self.free_poses
         return judged
 
@@ -596,7 +596,7 @@ class _Learner:
 
     def run(self) -> LearnedCard:
         work = self._work
-        # An earlier process may have come so far, and been killed then.
+        # An earlier process may have been killed after this.
         path = work.destination
         if work.made(self._request) is None:
             try:
@@ -626,7 +626,7 @@ class _Learner:
         return card
 
     def _make(self) -> Path:
-        """Go through the stages, each of which goes on where it was left."""
+        """Run the stages; each continues where it was stopped."""
         poses = self._poses()
         self._pace.expect(estimated_seconds(poses.topology.n_vertices, len(poses), self._quality))
         model = self._embedding(poses)
@@ -636,7 +636,7 @@ class _Learner:
         return self._predictor(model)
 
     def _go_on_by(self, first: FirstSamples, model: LearnedBody) -> None:
-        """Correct the estimates by the first samples, and stop where nearly all of them collide."""
+        """Update the estimates by the first samples, and stop if nearly all of them collide."""
         seconds = estimated_seconds(
             model.n_vertices,
             len(model.known_poses),
@@ -651,7 +651,7 @@ class _Learner:
 
     @property
     def _rig(self) -> str:
-        """The first file of a character among the sources; "" for none."""
+        """The first character file among the sources; "" for none."""
         sources = self._request.sources
         return next(
             (source for source in sources if Path(source).suffix.lower() in SCENE_SUFFIXES), ""
@@ -762,12 +762,12 @@ class _Learner:
         self._at(0.0)
 
     def _seconds(self) -> dict[str, float]:
-        """Return the seconds spent in each stage, by this process and those before."""
+        """Return the seconds spent in each stage, by this and earlier processes."""
         now = time.monotonic() - self._began
         return self._before | {str(self._stage): self._before[self._stage] + now}
 
     def _part(self, begin: float, end: float = 1.0) -> Job:
-        """Return the job of a part of a stage, from one fraction of the stage to another."""
+        """Return the job for a part of a stage, given by shares of the stage."""
         return self._job.part(
             lambda done, total: self._at(begin + (end - begin) * done / max(total, 1))
         )
@@ -780,12 +780,12 @@ class _Learner:
         now = time.monotonic()
         if now - self._noted > _SECONDS_BETWEEN_NOTES:
             self._noted = now
-            # A full disk stops what matters; a note that others read just now does not.
+            # A full disk must stop real work, but not a status update.
             with suppress(MeshFileError):
                 self._work.tell(replace(status, seconds=self._seconds()))
 
     def _leave(self, state: RunState, sentence: str = "", **more: Any) -> None:
-        """Say what has become of the run, unless the disk has no space even for that."""
+        """Write the final status, unless the disk is too full even for that."""
         last = replace(self._work.status, seconds=self._seconds(), seconds_left=None)
         with suppress(MeshFileError):
             self._work.tell(replace(last, state=state, sentence=sentence, **more))

@@ -1,4 +1,4 @@
-"""Resolve poses and meshes, the motions of a file, and those of a folder; all of it continues."""
+"""Resolve poses and meshes, the motions of a file, and those of a folder; all can be resumed."""
 
 from __future__ import annotations
 
@@ -57,17 +57,17 @@ _TABLE = "motions.csv"
 
 @dataclass(frozen=True, eq=False)
 class ResolvePosesRequest:
-    """Poses of a body to resolve, and where they are to be written.
+    """Poses of a body to resolve, and their output.
 
     Attributes
     ----------
     body : of the poses
     given : the poses
-    output : where to
+    output : where to write them
     options : of Resolve
-    export : how they are to be written
-    keep_detail : whether meshes get back what encoding lost of them, where they stay free
-    workers : threads, one for each available core by default
+    export : how to write them
+    keep_detail : whether to restore detail of meshes that encoding lost, where they stay free
+    workers : number of threads, by default one per available core
     """
 
     body: Body
@@ -81,15 +81,15 @@ class ResolvePosesRequest:
 
 @dataclass(frozen=True, eq=False)
 class ResolvedPose:
-    """What became of one pose.
+    """The outcome for one pose.
 
     Attributes
     ----------
-    given : as it was
+    given : the input
     result : of Resolve
-    file : that holds it
-    has_detail : whether what encoding lost of its mesh is in the file
-    stays_free : whether a free pose is free as the user's own form of file holds it
+    file : the output
+    has_detail : whether the output includes the detail of the mesh that encoding lost
+    stays_free : whether a free pose is still free as stored in the source file's form
     """
 
     given: GivenPose
@@ -99,19 +99,19 @@ class ResolvedPose:
     stays_free: bool
 
     def to_json(self) -> dict[str, Any]:
-        """Return what a report holds of it."""
+        """Return the values for a report."""
         row = {"source": self.given.source, "output": str(self.file), **_facts(self.result)}
         del row["converged"], row["note"]
         return row
 
 
 def resolve_poses(request: ResolvePosesRequest, job: Job) -> list[ResolvedPose]:
-    """Resolve poses and write them; stopped, the same request goes on from what is done.
+    """Resolve poses and write them; a stopped run continues when called again.
 
     Raises
     ------
-    LCollisionError : the output cannot be written, or is not of these poses.
-    CancelledError : the job was cancelled; what is done is kept beside the output.
+    LCollisionError : the output cannot be written, or holds results of other poses.
+    CancelledError : the job was cancelled; finished poses are kept beside the output.
     """
     body, given, options = request.body, request.given, request.options
     poses = [given_pose.pose for given_pose in given]
@@ -199,7 +199,7 @@ def _detailed(
     clearance: float,
     job: Job,
 ) -> list[npt.NDArray[np.float64] | None]:
-    """Return the resolved meshes with what encoding lost of them, None if that collides."""
+    """Return resolved meshes with the detail that encoding lost; None if they would collide."""
     from lcollision_core.bodies import with_detail
 
     detailed: list[npt.NDArray[np.float64] | None] = []
@@ -217,7 +217,7 @@ def _detailed(
 def _stays_free(
     body: Body, given: GivenPose, result: ResolveResult, file: WrittenPose, job: Job
 ) -> bool:
-    """Check a free pose as the user's own file holds it, and note where rounding made contact."""
+    """Check a free pose as stored in the source file's form, and note collisions by rounding."""
     if not result.exactly_free or file.vertices is None:
         return True
     n_pairs = len(file.checked(body).pairs)
@@ -241,14 +241,14 @@ def _stays_free(
 
 @dataclass(frozen=True)
 class Remote:
-    """A cluster that resolves the motions, and the body as its workers open it.
+    """A cluster that resolves motions, and the body as its workers open it.
 
-    The workers read and write the same paths as this process.
+    Workers read and write the same paths as this process.
 
     Attributes
     ----------
     scheduler : the address of a Dask scheduler
-    body : M, a file's path or the name of a bundled or user model
+    body : path of its file, or the name of a bundled or user model
     touch : see `Body.with_touching`
     """
 
@@ -259,19 +259,19 @@ class Remote:
 
 @dataclass(frozen=True, eq=False)
 class ResolveMotionsRequest:
-    """Motions of a body to resolve, and where they are to be written.
+    """Motions of a body to resolve, and their output.
 
     Attributes
     ----------
-    body : that moves
+    body : the body that moves
     files : of motions; none for the clips of the character itself
-    output : the character's own file again where its form is a mesh, else frames or poses
-    options : of the resolution
-    choice : which clip of a file, and its frames
-    workers : threads in all, one for each available core by default; unused with `remote`
-    remote : where files of a folder are resolved, one a task; here if None
-    root : a folder that the files are in; the subfolders are kept
-    only_check : of a folder, whether its motions are checked and the table is all that is written
+    output : a mesh output is the character's own file; others are frames or poses
+    options : of Resolve
+    choice : which clip of a file, and which frames
+    workers : number of threads in all, by default one per available core; unused with `remote`
+    remote : cluster that resolves the files of a folder; None to do it here
+    root : input folder; its subfolders are kept
+    only_check : for a folder, whether to check its motions and write only the table
     """
 
     body: Body
@@ -293,12 +293,12 @@ class ResolveMotionsRequest:
         options: MotionOptions | None = None,
         job: Job = UNWATCHED,
     ) -> ResolveMotionsRequest:
-        """Return the request for all motions of a folder, each to its own file of another.
+        """Return the request for all motions of a folder, each with its own output file.
 
         Raises
         ------
-        LCollisionError : the folder holds no motion, or the output cannot be written, or would
-            replace a file of it.
+        LCollisionError : the folder has no motion, or the output cannot be written or would replace
+            one of its files.
         """
         root, target = Path(folder), output_named(f"{os.fspath(output)}{os.sep}", of_motions=True)
         files = motion_files(root, job, besides=target.path)
@@ -311,16 +311,16 @@ class ResolveMotionsRequest:
         return request
 
     def refuse_to_replace(self, *, each: bool, in_place: bool = False) -> None:
-        """Refuse outputs that are inputs.
+        """Raise if an output would replace an input.
 
         Parameters
         ----------
-        each : whether each file comes to one of its own
-        in_place : whether the user wants that
+        each : whether each file has its own output
+        in_place : whether the user allows it
 
         Raises
         ------
-        LCollisionError : naming the first of them.
+        LCollisionError : names the first such file.
         """
         path, outputs = self.output.path, [self.output.path]
         if each:
@@ -335,13 +335,13 @@ Row = ResolvedClip | FailedFile
 
 @dataclass(frozen=True)
 class FolderStatus:
-    """How far the motions of a folder are.
+    """Progress on the motions of a folder.
 
     Attributes
     ----------
-    n_done, n_files : files that are done, and all of them
-    rows : of the files that have finished since the last report
-    seconds_left : estimated by the files' sizes; None before the first of this run has ended
+    n_done, n_files : numbers of finished files and of all files
+    rows : of the files finished since the last report
+    seconds_left : estimated by file size; None until the first file of this run is finished
     """
 
     n_done: int
@@ -351,17 +351,17 @@ class FolderStatus:
 
 
 _Files = Sequence[tuple[Path, Path]]
-"""Files of motions, and where each is written to."""
+"""Files of motions, and their outputs."""
 _Results = Generator[tuple[Path, list[Row]], None, None]
 
 
 def resolve_motions(request: ResolveMotionsRequest, job: Job) -> list[ResolvedClip]:
-    """Resolve the motions of some files, and write them into one output.
+    """Resolve the motions of some files, and write them to one output.
 
     Raises
     ------
     LCollisionError : an input cannot be read, or the output cannot hold the motions.
-    CancelledError : the job was cancelled; what is done is kept beside the output.
+    CancelledError : the job was cancelled; finished frames are kept beside the output.
     """
     from lcollision_core.bodies.motions import read_motions
 
@@ -397,11 +397,11 @@ def resolve_motions(request: ResolveMotionsRequest, job: Job) -> list[ResolvedCl
 
 
 def own_file(body: Body) -> Path:
-    """Return the file of a character, whose clips are motions of it.
+    """Return the file of a character with clips.
 
     Raises
     ------
-    LCollisionError : the body has no clips of its own.
+    LCollisionError : the body has no clips.
     """
     if body.character is None or body.character.smpl is not None:
         raise LCollisionError("names no motion", "name a motion file", where=body.name)
@@ -411,7 +411,7 @@ def own_file(body: Body) -> Path:
 def resolve_one(
     request: ResolveMotionsRequest, motion: Motion, run: Run[KeptPose], first: int, job: Job
 ) -> tuple[MotionChange, ResolvedClip]:
-    """Resolve one motion, whose frames have names from `first` on in the run."""
+    """Resolve one motion; its frames are named from `first` on in the run."""
     from lcollision_core.bodies import NamedPose
     from lcollision_core.bodies.motions import MotionChange, ground_facts
     from lcollision_core.motion import (
@@ -467,7 +467,7 @@ def resolve_one(
 
 
 def _check_motion(request: ResolveMotionsRequest, motion: Motion, job: Job) -> ResolvedClip:
-    """Check one motion, which stays as it is."""
+    """Check one motion without changing it."""
     from lcollision_core.motion import MotionReport, contact_report, screen_motion
 
     start, choice = time.perf_counter(), request.choice
@@ -521,11 +521,11 @@ def _row(
 
 
 class _Budget(Job):
-    """A job that is cancelled once its time has passed, but not before all frames are checked.
+    """A job that is cancelled when its time is up, but not before all frames are checked.
 
     Attributes
     ----------
-    watched : of the work, which reports once they are
+    watched : job for the search; its first report means that all frames are checked
     """
 
     def __init__(self, seconds: float, job: Job) -> None:
@@ -540,14 +540,14 @@ class _Budget(Job):
 
     @property
     def cancelled(self) -> bool:
-        """Whether the time has passed."""
+        """Whether the time is up."""
         return self._is_checked and time.monotonic() > self._end
 
 
 def run_of_motions(
     request: ResolveMotionsRequest, motions: Sequence[Motion], job: Job
 ) -> AbstractContextManager[Run[KeptPose]]:
-    """Return what is done of motions, by the numbers of their frames one after the other."""
+    """Return the run of some motions, with consecutive frame numbers."""
     body, files = request.body, request.files
     inputs = _inputs_of_motions(body, files, motions, request.options)
     return run_of_poses(request.output.path, body, inputs, sum(map(len, motions)), job)
@@ -557,7 +557,7 @@ def _inputs_of_motions(
     body: Body, files: Sequence[Path], motions: Sequence[Motion], options: MotionOptions
 ) -> tuple[Arrays, dict[str, Any]]:
     arrays, values = depends_on(body, options.frame)
-    # Frames have shapes of their own, which codes do not hold.
+    # The file stamps stand for shapes of frames, which codes do not include.
     values = {**values, "files": [_stamp(path) for path in files]}
     for number, motion in enumerate(motions):
         arrays |= {f"codes {number}": motion.codes, f"times {number}": motion.times}
@@ -572,7 +572,7 @@ def _inputs_of_motions(
 
 
 def _as_frames(output: Output, files: Sequence[Path]) -> Output:
-    """Return the output: frames where a skeleton is written that the input does not have."""
+    """Return the output, in the form of frames if the input is not of its skeleton format."""
     from lcollision_core.files.table import OWN_SUFFIXES, SKELETON_SUFFIXES
 
     suffix = output.path.suffix.lower()
@@ -585,7 +585,7 @@ def _as_frames(output: Output, files: Sequence[Path]) -> Output:
 def _require_output(
     output: Output, body: Body, files: Sequence[Path], motions: Sequence[Motion]
 ) -> None:
-    """Refuse an output that cannot hold the motions, before the work for it is done."""
+    """Raise early if an output cannot hold the motions."""
     from lcollision_core.bodies.motions import character_of_motion, is_carried, is_of_skeleton
     from lcollision_core.bodies.retargeting import require_skeleton
     from lcollision_core.files.table import BVH_SUFFIX, OWN_SUFFIXES
@@ -596,7 +596,7 @@ def _require_output(
         require_skeleton(output.path, body)
     if suffix in OWN_SUFFIXES and output.form == "mesh":
         is_own = files[0].suffix.lower() == suffix and is_of_skeleton(files[0])
-        # A motion of SMPL that another body follows holds none of that body's joints.
+        # A retargeted SMPL motion cannot hold the body's joints.
         is_own = is_own and (suffix == BVH_SUFFIX or not is_carried(body, files[0]))
         if len(files) > 1 or not is_own:
             raise MeshFileError.unwritable(
@@ -632,7 +632,7 @@ def write_motions(
     rows: Sequence[ResolvedClip],
     job: Job,
 ) -> None:
-    """Write motions, and correct the rows by the check of what was written."""
+    """Write motions, and update their rows by the check of the output."""
     from lcollision_core.bodies import NamedPose, unique_names
     from lcollision_core.files.table import SKELETON_SUFFIXES
 
@@ -649,13 +649,13 @@ def write_motions(
     ]
     request = ExportRequest(fps=motions[0].rate)
     source = require_request(output, body, poses, request)
-    # One after the other: all of them may take more memory than there is.
+    # Lazily: all meshes at once may not fit in memory.
     meshes = (motion.vertices(n, check) for motion, n in frames)
     is_skeleton = output.path.suffix.lower() in SKELETON_SUFFIXES
     posed = write_result(
         output, body, poses, request, meshes, source, keeps_meshes=is_skeleton, job=job
     )
-    # The turns of joints alone may not hold all of a frame.
+    # Joint rotations alone may not express a frame exactly.
     if is_skeleton:
         (row,) = rows
         collides = np.zeros(len(posed), dtype=np.bool_)
@@ -680,12 +680,12 @@ def _count_stuck(
     collides: npt.NDArray[np.bool_],
     put_back: Sequence[range] = (),
 ) -> None:
-    """Count frames that collide as they were written, and give the reason.
+    """Add frames that collide in the output to a row, with the reason.
 
     Parameters
     ----------
-    collides : (T,) what the file holds
-    put_back : frames that were written as they had been
+    collides : (T,) verdicts of the output
+    put_back : frames that were written unchanged
     """
     from lcollision_core.motion import KeptSpan, Reason
     from lcollision_core.motion.motion import runs
@@ -711,7 +711,7 @@ def _write_clips(
     rows: Sequence[ResolvedClip],
     job: Job,
 ) -> None:
-    """Write the character's own file with its changed clips, or with those of another skeleton."""
+    """Write the character's file with changed clips, or with retargeted motions as new ones."""
     from lcollision_core.bodies.motions import is_carried, write_clips, write_new_clips
 
     with locked(output.path):
@@ -727,7 +727,7 @@ def _write_clips(
     job.note(say("wrote {clips} to {path}", clips=counted(len(changes), "clip"), path=path))
     for row, of_file, put_back in zip(rows, written.free, written.put_back, strict=True):
         row.output = str(path)
-        # Rounding takes a little of the clearance; as written, frames are free of contact.
+        # Rounding reduces the clearance slightly; without one, the check of the file decides.
         if row.clearance == 0.0:
             row.colliding_frames = []
         _count_stuck(row, body, ~of_file, put_back)
@@ -737,15 +737,15 @@ def _write_clips(
 
 
 def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
-    """Resolve the motions of several files, several at a time, each to its own file of a folder.
+    """Resolve the motions of several files in parallel, each to its own file of a folder.
 
-    A table of all, `motions.csv`, is written beside them. A file that cannot be read is a row with
-    its sentence. A stopped run continues: files that are done are not resolved again. The job
-    reports a `FolderStatus` as it begins, and as each file ends.
+    A table of all, `motions.csv`, is written beside them. A file that cannot be read has a row
+    with the error. A stopped run continues without its finished files. The job reports a
+    `FolderStatus` at the start and after each file.
 
     Raises
     ------
-    LCollisionError : the folder cannot be written, or as of `run_on_cluster`.
+    LCollisionError : the folder cannot be written; also see `run_on_cluster`.
     CancelledError : the job was cancelled.
     """
     from lcollision_core.bodies import unique_names
@@ -755,7 +755,7 @@ def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
     outputs = motion_outputs(request.body, files, folder, request.root)
     paths = dict(zip(unique_names(_name(path, request.root) for path in files), files, strict=True))
     names = {path: name for name, path in paths.items()}
-    # As the files are now: one that is saved while it is resolved is resolved again.
+    # Taken at the start, so that a file saved during the run is resolved again.
     stamps = {path: _stamp(path) for path in files}
 
     def is_current(name: str, item: Any) -> bool:
@@ -794,7 +794,7 @@ def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
 
 
 def _row_of(values: dict[str, Any]) -> Row:
-    """Return a row from what a report holds of it."""
+    """Return a row from its values in a report."""
     if "error" in values:
         return FailedFile(values["source"], values["error"])
     names = {field.name for field in fields(ResolvedClip)}
@@ -852,7 +852,7 @@ def _resolved_there(request: ResolveMotionsRequest, files: _Files, job: Job) -> 
 
 @dataclass(frozen=True)
 class _OnWorker:
-    """What a worker needs to resolve motions as this process would."""
+    """Everything a worker needs to resolve motions."""
 
     body: str
     touch: tuple[str, ...]
@@ -892,7 +892,7 @@ def resolve_on_worker(shared: _OnWorker, item: tuple[Path, Path]) -> FromWorker[
 def _resolve_file(
     request: ResolveMotionsRequest, path: Path, output: Path, n_threads: int, job: Job
 ) -> list[Row]:
-    """Resolve the motions of one file; a row with a sentence where that fails."""
+    """Resolve the motions of one file; on failure return a row with the error."""
     try:
         if not request.only_check:
             output.parent.mkdir(parents=True, exist_ok=True)
@@ -910,13 +910,13 @@ def _resolve_file(
 def motion_outputs(
     body: Body, files: Iterable[Path], folder: Path, root: Path | None = None
 ) -> dict[Path, Path]:
-    """Return where each file's motions go: the own kind of file, else a point cache.
+    """Return the output of each file's motions: its own kind of file, else a point cache.
 
     Parameters
     ----------
     files : of motions
-    folder : that the results come to
-    root : a folder that the files are in; its subfolders are kept
+    folder : of the results
+    root : input folder; its subfolders are kept
     """
     from lcollision_core.bodies import unique_names
     from lcollision_core.bodies.motions import is_carried, is_of_skeleton
@@ -946,7 +946,7 @@ def motion_outputs(
 
 
 def _name(path: Path, root: Path | None) -> str:
-    """Return what a file is called in the table: with its subfolders."""
+    """Return a file's name in the table, with its subfolders."""
     return path.name if root is None else path.relative_to(root).as_posix()
 
 
@@ -963,7 +963,7 @@ def _key_of_folder(request: ResolveMotionsRequest) -> str:
 
 
 def _stamp(path: Path) -> list[int]:
-    """Return the size and the time of a file; zeros of one that is missing."""
+    """Return the size and time of a file; zeros if it is missing."""
     return list((file_stamp(path) or (0, 0, 0, 0))[2:])
 
 
