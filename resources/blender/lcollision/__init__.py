@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""LCollision in Blender: where a rigged mesh runs into itself, and poses and actions that do not.
+"""LCollision in Blender: find and resolve self-collisions of rigged meshes in poses and actions.
 
-The engine is a process of its own, which this add-on asks.
+The engine is a separate process that this add-on sends requests to.
 """
 
 from . import actions, cloth, drawing, found, link, live, operators, panel, rules
@@ -20,7 +20,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take all of it away, and end the engine."""
+    """Remove everything, and end the engine."""
     live.unregister()
     found.unregister()
     drawing.unregister()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Actions: which frames collide, and copies of them with new keys where that is resolved."""
+"""Actions: the frames that collide, and resolved copies with new keys."""
 
 import re
 from collections import deque
@@ -30,34 +30,34 @@ from .scene import OFF_RIG, Caution, Rigged, SceneError
 from .steps import Stepped
 
 TOLERANCE = 5e-4
-"""By how much curves between keys may be off, and a bone that stays: radians (0.03 degrees), for
-locations lengths of the longest bone. Where that collides, it is a tenth, and then nothing: all
-that turns is keyed in every frame."""
+"""Largest error of curves between keys, and of bones that are not keyed: radians (0.03 degrees), or
+for locations lengths of the longest bone. If the result collides, a tenth of it is tried, then
+zero, which keys every turned bone in every frame."""
 
 _SAME = 1e-6
-"""What has turned by no more there stays too, as it is rounding."""
+"""Smaller turns are rounding and are not keyed either."""
 
 _ROUGHER, _JUMP = 3.0, 0.1
-"""A span in which a bone's velocity changes more than it did, by this factor, and by more than this
-share of the skeleton's size from a frame to the next, is worse than it was."""
+"""A span is worse than before if a bone's change of velocity between frames exceeds both `_ROUGHER`
+times the former one and `_JUMP` times the skeleton's size."""
 
 _FREE = ".free"
 _IN_FLIGHT = 4
 _BESIDE = 2
-"""Frames on each side of a range by which it is known how the motion goes on."""
+"""Frames read on each side of a range, so that the motion's continuation is known."""
 _POSES_A_SECOND, _MOST_POSES = 10, 300
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What frames are checked for.
+    """The requirements that frames are checked for.
 
     Attributes
     ----------
     clearance : to be kept, in body sizes
     subframes : poses between two frames that are checked too, with the linear paths of the vertices
-        from each to the next; None where only frames are
-    last : the frame after which nothing is checked
+        from each to the next; None to check only frames
+    last : the last frame to check
     """
 
     clearance: float
@@ -66,13 +66,13 @@ class Wanted:
 
     @property
     def asked(self) -> dict:
-        """Return what the engine is asked between frames."""
+        """The fields of an engine request for poses between frames."""
         if self.subframes is None:
             return {}
         return {"substeps": self.subframes, "continuous": True}
 
     def shares_after(self, number: int) -> list[float]:
-        """Return the shares of the way from a frame to the next at which poses are checked."""
+        """Return the fractions between a frame and the next at which poses are checked."""
         if self.subframes is None or number >= self.last:
             return []
         return [at / (self.subframes + 1) for at in range(1, self.subframes + 2)]
@@ -80,17 +80,17 @@ class Wanted:
 
 @dataclass
 class Frames:
-    """What is shown frame by frame.
+    """The frames of a motion as Blender shows them.
 
     Attributes
     ----------
     numbers : of the frames
-    within : places, from 0, of those that count and may change; the others are beside them
-    transforms : of each (J, 4, 4) of the bones
-    vertices : of each (W, 3)
-    states : of each, the properties that are written
-    matrices : of each, all bones' transforms by name, where they are to be baked
-    found : the engine's checks
+    within : indices of the frames that count and may change; the others are neighbours
+    transforms : for each frame (J, 4, 4) of the bones
+    vertices : for each frame (W, 3)
+    states : for each frame, the properties that are written
+    matrices : for each frame, all bones' transforms by name, if they are to be baked
+    found : for each frame, the engine's check
     """
 
     numbers: list[int]
@@ -103,12 +103,12 @@ class Frames:
 
     @property
     def colliding(self) -> list[int]:
-        """The places, from 0, of frames that collide."""
+        """The indices of frames that collide."""
         return [at for at in self.within if self.found[at]["colliding"]]
 
     @property
     def not_counted(self) -> str:
-        """Say what the contact rules leave out of the frames; empty where that is nothing."""
+        """A sentence on pairs that the contact rules leave out; empty if there are none."""
         replies = [self.found[at] for at in self.within if self.found[at]["not_counted"]]
         if not replies:
             return ""
@@ -120,7 +120,7 @@ class Frames:
         )
 
     def in_words(self) -> str:
-        """Name the frames that collide."""
+        """List the frames that collide, as runs."""
         runs: list[list[int]] = []
         for number in (self.numbers[at] for at in self.colliding):
             if runs and number == runs[-1][-1] + 1:
@@ -138,11 +138,11 @@ def action_of(rigged: Rigged) -> bpy.types.Action | None:
 
 
 def frame_range(rigged: Rigged, scene: bpy.types.Scene) -> list[int]:
-    """Return the frames that the panel says, else those of `whole_range`.
+    """Return the frame range of the panel if it is used, else `whole_range`.
 
     Raises
     ------
-    SceneError : the last comes before the first.
+    SceneError : the range ends before it starts.
     """
     settings = scene.lcollision
     if not settings.use_range:
@@ -153,7 +153,7 @@ def frame_range(rigged: Rigged, scene: bpy.types.Scene) -> list[int]:
 
 
 def whole_range(rigged: Rigged, scene: bpy.types.Scene) -> list[int]:
-    """Return the frames of the armature's action, of the scene where it has none."""
+    """Return the frames of the armature's action, or of the scene if it has none."""
     first, last, action = scene.frame_start, scene.frame_end, action_of(rigged)
     if action is not None:
         first, last = (round(one) for one in action.frame_range)
@@ -161,9 +161,9 @@ def whole_range(rigged: Rigged, scene: bpy.types.Scene) -> list[int]:
 
 
 def with_neighbours(numbers: list[int], whole: list[int]) -> tuple[list[int], range]:
-    """Return frames with those of the whole motion beside them, and the places of the former.
+    """Return frames with their neighbours in the whole motion, and the indices of the former.
 
-    A correction fades towards these, which stay as they are.
+    A correction fades towards the neighbours, which do not change.
     """
     first = max(numbers[0] - _BESIDE, min(whole[0], numbers[0]))
     last = min(numbers[-1] + _BESIDE, max(whole[-1], numbers[-1]))
@@ -180,13 +180,13 @@ def read_frames(
     keep: bool,
     within: range | None = None,
 ) -> Iterator[str]:
-    """Go through frames step by step, check each as it is shown, and return `Frames`.
+    """Go through frames step by step, check each as shown, and return `Frames`.
 
-    What is wrong between a frame and the next is the frame's.
+    A collision between a frame and the next counts for the former.
 
     Parameters
     ----------
-    keep : whether vertices are kept
+    keep : whether to keep vertices
     """
     frames = Frames(numbers, within or range(len(numbers)))
     waiting, scene = deque(), context.scene
@@ -222,11 +222,11 @@ def read_frames(
 
 
 def _answers(character: Opened, requests: list[Request]) -> Generator[str, None, dict]:
-    """Return the check of a frame, with what those of the poses up to the next have found."""
+    """Return the check of a frame, combined with those of the poses up to the next frame."""
     for request in requests:
         yield from waited(character.engine, request, "Checking")
     replies = [request.result() for request in requests]
-    # The last pose is that of the next frame.
+    # The last pose belongs to the next frame.
     poses = replies[:-1] or replies
     worst = max(poses, key=lambda one: (one["pairs"], one["deepest"]))
     touches = any(one["touches_between"] for one in replies[1:])
@@ -240,7 +240,7 @@ def _answers(character: Opened, requests: list[Request]) -> Generator[str, None,
 
 
 def list_frames(scene: bpy.types.Scene, frames: Frames) -> None:
-    """Put markers on the timeline, and the frames that collide into the panel's list."""
+    """List the colliding frames in the panel, and mark them on the timeline."""
     markers, settings = scene.timeline_markers, scene.lcollision
     clear_frames(scene)
     for at in frames.colliding:
@@ -254,7 +254,7 @@ def list_frames(scene: bpy.types.Scene, frames: Frames) -> None:
 
 
 def verdict(frames: Frames, settings: bpy.types.PropertyGroup) -> str:
-    """Say how many frames collide."""
+    """Return a sentence on how many frames collide."""
     n, bad = len(frames.within), len(frames.colliding)
     if not bad:
         return f"{settings.kept()} in {n} frames ({settings.checked()})"
@@ -269,7 +269,7 @@ class LCOLLISION_OT_check_action(Stepped, bpy.types.Operator):
     bl_label = "Check Action"
 
     def steps(self, context, settings) -> Steps:
-        """Check frame by frame, and list what was found."""
+        """Check frame by frame, and list the results."""
         rigged = Rigged.of(context)
         character = yield from open_character(rigged, settings)
         numbers, wanted = frame_range(rigged, context.scene), Wanted(character.clearance(rigged))
@@ -287,7 +287,7 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
     bl_label = "Resolve Action"
 
     def steps(self, context, settings) -> Steps:
-        """Read, resolve, write a copy of the action, and check what Blender makes of it."""
+        """Read, resolve, write a copy of the action, and check it as Blender shows it."""
         rigged = Rigged.of(context)
         resolved = yield from resolving(context, rigged, settings)
         frames, written, now = resolved.frames, resolved.written, resolved.now
@@ -309,15 +309,15 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
 
 @dataclass
 class Resolved:
-    """What has become of a motion.
+    """The result of resolving a motion.
 
     Attributes
     ----------
-    character, wanted : by which its frames are checked
-    frames : as they were
-    written : what is better; None where nothing is, and nothing is changed
+    character, wanted : used for checking its frames
+    frames : as before
+    written : the better action; None if there is none and nothing was changed
     unkeyable : bones that could not turn, and why
-    kept : what the engine has not freed, and why, by places of frames
+    kept : spans that the engine has not freed, with reasons; frames by index
     """
 
     character: Opened
@@ -329,7 +329,7 @@ class Resolved:
 
     @property
     def now(self) -> Frames:
-        """The frames as they are now."""
+        """The present frames."""
         return self.frames if self.written is None else self.written.now
 
 
@@ -340,12 +340,12 @@ def resolving(
     gap: float | None = None,
     subframes: int | None = None,
 ) -> Generator[str, None, Resolved]:
-    """Read a motion, resolve it, write a copy of its action, and check what Blender makes of it.
+    """Read a motion, resolve it, write a copy of its action, and check it as Blender shows it.
 
     Parameters
     ----------
     gap : the clearance in the scene's unit; the panel's if None
-    subframes : as of `Wanted`
+    subframes : see `Wanted`
     """
     scene = context.scene
     rigged.ensure_writable()
@@ -389,7 +389,7 @@ def resolving(
 
 
 def _targets(rigged: Rigged) -> list[Rigged]:
-    """Return what an action may be written to, in the order in which that is tried.
+    """Return the targets that an action may be written to, in the order to try.
 
     Raises
     ------
@@ -407,7 +407,7 @@ def _targets(rigged: Rigged) -> list[Rigged]:
 
 
 def told_of(written: "Written", frames: Frames) -> str:
-    """Say what has become of an action."""
+    """Return a sentence on the resolved action."""
     again = written.now
     left = len(again.colliding)
     told = (
@@ -424,14 +424,14 @@ def told_of(written: "Written", frames: Frames) -> str:
 
 
 def _why(unkeyable: dict[str, str]) -> str:
-    """Say which bones did not turn, and why."""
+    """Return a list of bones that did not turn, and why."""
     return "".join(f"; {name} stays ({why})" for name, why in unkeyable.items())
 
 
 def _spans(reply: dict) -> dict[range, slice]:
-    """Return the places of frames that the engine may have changed, and where its turns are.
+    """Return the spans, as frame indices, that the engine may have changed, with their reply rows.
 
-    Spans that touch are one: there is no frame between them that stays.
+    Spans that touch are merged, as no unchanged frame lies between them.
     """
     found: list[range] = []
     for start, stop in reply["spans"]:
@@ -444,16 +444,16 @@ def _spans(reply: dict) -> dict[range, slice]:
 
 
 class Turned:
-    """What the engine turns in a span of frames.
+    """The engine's turns in a span of frames.
 
     Parameters
     ----------
     reply : the engine's
-    rows : of the reply, which the span has
+    rows : rows of the reply that belong to the span
 
     Attributes
     ----------
-    joints, turns : numbers of n joints, and of each frame their (n, 4, 4) turns
+    joints, turns : indices of n joints, and for each frame their (n, 4, 4) turns
     """
 
     def __init__(self, reply: dict, rows: slice) -> None:
@@ -461,9 +461,10 @@ class Turned:
 
 
 def _cost(span: range, before: Frames, now: Frames, lengths: np.ndarray) -> tuple:
-    """Return what is less of the better of two ways to show a span.
+    """Return the cost of a version of a span, as a tuple to compare.
 
-    First whether a frame has more pairs than it had before, or deeper ones, or bones jump.
+    First comes whether a frame has more or deeper pairs than before, or bones jump; then the
+    numbers of colliding frames and of pairs.
 
     Parameters
     ----------
@@ -485,7 +486,7 @@ def _jump(transforms: np.ndarray, lengths: np.ndarray) -> float:
     Parameters
     ----------
     transforms : (T, J, 4, 4) of the bones
-    lengths : (J,) of these
+    lengths : (J,) of the bones
     """
     points = _ends(transforms, lengths)
     if len(points) < 3:
@@ -495,7 +496,7 @@ def _jump(transforms: np.ndarray, lengths: np.ndarray) -> float:
 
 
 def _ends(transforms: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Return (T, 3 J, 3) points of bones, of (T, J, 4, 4) transforms and (J,) lengths."""
+    """Return (T, 3 J, 3) points of bones with (T, J, 4, 4) transforms and (J,) lengths."""
     heads = transforms[..., :3, 3]
     ends = [heads + lengths[:, None] * transforms[..., :3, axis] for axis in range(2)]
     return np.concatenate([heads, *ends], axis=1)
@@ -503,14 +504,13 @@ def _ends(transforms: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Plan:
-    """What a copy of an action is to show.
+    """The content of a copy of an action.
 
     Attributes
     ----------
-    values : of each property that changes its (T, C) float32 values
-    spans : places of frames in which that is, apart from each other, and by how much keys may be
-        off there
-    jumps : properties that jump into a span and out of it, as where a limb is posed by FK there
+    values : for each property that changes, its (T, C) float32 values
+    spans : disjoint spans of frame indices that change, with the tolerance of keys in each
+    jumps : properties that jump into and out of a span, as when a limb is posed by FK there
     """
 
     values: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
@@ -527,7 +527,7 @@ class Plan:
 
         Parameters
         ----------
-        before : returns the values that a property had
+        before : returns the original values of a property
         """
         values, spans, jumps = dict(self.values), dict(self.spans), set(self.jumps)
         for span, own in rows.items():
@@ -548,12 +548,12 @@ class Plan:
 
 @dataclass(frozen=True)
 class Rows:
-    """What the properties that are written are to be in a span.
+    """The values of written properties in a span.
 
     Attributes
     ----------
-    values : (n, C) of its n frames
-    jumps : as of `Plan`
+    values : (n, C) for its n frames
+    jumps : see `Plan`
     """
 
     values: dict[tuple[str, str], np.ndarray]
@@ -565,16 +565,16 @@ class Written:
 
     Parameters
     ----------
-    rigged : with the action; one that is copied is baked once something turns
-    frames : as they are
+    rigged : the character with the action; if it needs a copy, that is baked once something turns
+    frames : the present frames
 
     Attributes
     ----------
-    rigged : what has the new action
-    action : that
-    old : the user's, which stays
+    rigged : the character with the new action
+    action : the new action
+    old : the user's action, which stays
     now : the frames as Blender shows them with the new action
-    kept : what the engine has not freed, and why, by places of frames
+    kept : spans that the engine has not freed, with reasons; frames by index
     """
 
     def __init__(self, rigged: Rigged, frames: Frames) -> None:
@@ -587,7 +587,7 @@ class Written:
         self._source = self.action = self._slot = None
 
     def _begin(self) -> None:
-        """Bake a copy, if one is written, and take hold of the action."""
+        """Bake a copy if one is written, and remember the source action and its slot."""
         if self.rigged.is_copied:
             self._bake()
         data = self.rigged.armature.animation_data
@@ -597,12 +597,12 @@ class Written:
 
     @property
     def by_fk(self) -> set[str]:
-        """The limbs that are switched to FK somewhere."""
+        """The limbs that are switched to FK in any span."""
         return {name for name, path in self._plan.jumps if path.startswith("[")}
 
     @property
     def acceleration(self) -> float:
-        """The mean squared acceleration of the bones' ends in the spans, over that before."""
+        """The mean squared acceleration of the bones' ends in the spans, relative to before."""
         near = {at for span in self._plan.spans for at in range(span.start - 1, span.stop + 1)}
         middles = np.array(sorted(near & set(range(1, len(self._frames.numbers) - 1))), int)
         lengths = self.rigged.lengths()
@@ -619,11 +619,11 @@ class Written:
     def resolve(
         self, context: bpy.types.Context, character: Opened, wanted: Wanted, asked: dict
     ) -> Iterator[str]:
-        """Go on step by step from what Blender shows, until that is free or gets no freer.
+        """Repeat from what Blender shows, until it is free or no longer improves.
 
         Returns
         -------
-        is_done : whether something is better now
+        is_done : whether the result is better
         """
         level, is_better, frames = 0, False, self._frames
         is_off = max(one["off_rig"] for one in frames.found) > OFF_RIG
@@ -658,7 +658,7 @@ class Written:
             is_better |= is_step
             if not self.now.colliding:
                 break
-            # Frames that the engine has not freed, no further step of its frees, if it sees them.
+            # If the engine sees all remaining collisions, another step would not free them.
             seen = {*reply["colliding_frames"], *reply["in_between"], *reply["touching"]}
             is_known = seen.issuperset(self.now.colliding)
             if is_known and not is_off:
@@ -666,7 +666,7 @@ class Written:
             level = 0 if is_step else level + 1
             if level == len(LEVELS):
                 break
-        # Where controls do not bring what the engine has found, a copy may.
+        # If the controls cannot reproduce the engine's result, a baked copy may.
         is_all = not self.now.colliding or is_known or self._original.controls is None
         pairs = zip(self.now.found, frames.found, strict=True)
         return is_better and is_all and not any(is_worse(now, before) for now, before in pairs)
@@ -680,7 +680,7 @@ class Written:
         spans: dict[range, slice],
         is_off: bool,
     ) -> Iterator[str]:
-        """Write what the engine turns in spans, and keep what Blender then shows to be better."""
+        """Write the engine's turns in spans, and keep those that improve what Blender shows."""
         turned = {span: Turned(reply, rows) for span, rows in spans.items()}
         rows = yield from self._rows(turned)
         lengths = self.rigged.lengths()
@@ -707,12 +707,12 @@ class Written:
                 break
 
     def _rows(self, turned: dict[range, Turned]) -> Generator[str, None, dict[range, Rows]]:
-        """Find what the properties become where bones turn from where they are shown now."""
+        """Return the properties' values after turning the bones from their shown pose."""
         scene, found = bpy.context.scene, {}
         before = scene.frame_current
         try:
             for span, one in turned.items():
-                # A limb is posed by FK in all of a span, or in none of it.
+                # A limb is posed by FK in a whole span, or not at all.
                 by_fk, is_settled = set(), False
                 while not is_settled:
                     is_settled, states = True, []
@@ -735,7 +735,7 @@ class Written:
         return found
 
     def _states_now(self) -> list[State]:
-        """Return the properties of all frames as they are now: of a copy as it was baked."""
+        """Return the present properties of all frames; those of a new copy are as baked."""
         return self._states if self.now is self._frames else self.now.states
 
     def _show(
@@ -746,7 +746,7 @@ class Written:
         spans: Iterable[range],
         is_off: bool,
     ) -> Iterator[str]:
-        """Write the plan, and read the frames of some spans as Blender then shows them."""
+        """Write the plan, and read the frames of some spans again as Blender shows them."""
         self._write()
         places = sorted({at for span in spans for at in span})
         numbers = [self._frames.numbers[at] for at in places]
@@ -766,14 +766,14 @@ class Written:
         self.now = now
 
     def _assign(self, action: bpy.types.Action) -> None:
-        """Give the armature an action, by the slot that it had of the old one."""
+        """Assign an action to the armature, with the same slot as the old one."""
         data = self.rigged.armature.animation_data
         data.action = action
         if self._slot is not None:
             data.action_slot = next(one for one in action.slots if one.identifier == self._slot)
 
     def take_back(self) -> None:
-        """Leave everything as it was before."""
+        """Restore everything as it was before."""
         if self.rigged is not self._original:
             self.rigged.remove_copy()
             for action in filter(None, (self._source, self.action)):
@@ -788,7 +788,7 @@ class Written:
         scene.frame_set(scene.frame_current)
 
     def finish(self) -> None:
-        """Keep the new action, and the old one in the file though nothing uses it."""
+        """Keep the new action, and keep the old one in the file by a fake user."""
         if self.rigged is not self._original:
             bpy.data.actions.remove(self._source)
         elif self._source.library is None:
@@ -796,7 +796,7 @@ class Written:
         self.action.name = self._name
 
     def _bake(self) -> None:
-        """Key all bones of a copy in all frames as they are shown."""
+        """Key all bones of a copy in all frames as shown."""
         self.rigged = copy = self.rigged.baked_copy()
         self._source = action = bpy.data.actions.new(self._name)
         copy.armature.animation_data_create().action = action
@@ -810,7 +810,7 @@ class Written:
         self._pose = copy.state()
 
     def _write(self) -> None:
-        """Write a new copy of the action as the plan says."""
+        """Write a new copy of the action according to the plan."""
         past = self.action
         self.action = self._source.copy()
         self._assign(self.action)
@@ -842,13 +842,13 @@ class Written:
         self.action.update_tag()
 
     def _before(self, key: tuple[str, str]) -> np.ndarray:
-        """Return the (T, C) float32 values of a bone's property as they were."""
+        """Return the original (T, C) float32 values of a bone's property."""
         return np.array([state[key] for state in self._states], np.float32)
 
     def _curves(
         self, bone: bpy.types.PoseBone, path: str, n: int
     ) -> tuple[list[bpy.types.FCurve], list[bool]]:
-        """Return the curves of a bone's property, and which of them were made for this."""
+        """Return the curves of a bone's property, and which of them were newly made."""
         item, own = self.rigged.armature, whole_path(bone, path)
 
         def existing() -> dict[int, bpy.types.FCurve]:
@@ -870,7 +870,7 @@ def check_action(rigged: Rigged) -> None:
 
     Raises
     ------
-    SceneError : it is edited or blended in the NLA.
+    SceneError : the action is edited or blended in the NLA.
     """
     name, data = rigged.armature.name, rigged.armature.animation_data
     if data.use_tweak_mode:
@@ -887,7 +887,7 @@ def check_action(rigged: Rigged) -> None:
 
 
 def _free_name(name: str) -> str:
-    """Return the name of a copy; that of a copy of a copy is no longer."""
+    """Return the name of a copy; a copy of a copy gets the same name."""
     return re.sub(rf"({re.escape(_FREE)}(\.\d+)?)*$", "", name) + _FREE
 
 
@@ -901,6 +901,6 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take them away."""
+    """Remove the operators."""
     for one in reversed(_CLASSES):
         bpy.utils.unregister_class(one)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Motions that cloth solvers take: parts keep a gap, in frames, between them, and on the way."""
+"""Motions fit for cloth solvers: parts keep a gap in frames and between them."""
 
 import struct
 from collections.abc import Generator, Iterator
@@ -17,10 +17,10 @@ from .scene import Caution, Rigged, SceneError
 from .steps import Stepped
 
 CACHE = "LCollision Cache"
-"""The name of the modifiers that show caches."""
+"""Name of the modifiers that show caches."""
 
 REPORT = "Cloth Report"
-"""The name of the text."""
+"""Name of the text with the report."""
 
 _SHOWN_OTHERWISE = "Blender shows it otherwise than its bones alone would"
 
@@ -32,7 +32,7 @@ class LCOLLISION_OT_prepare_cloth(Stepped, bpy.types.Operator):
     bl_label = "Prepare for Cloth"
 
     def steps(self, context, settings) -> Steps:
-        """Resolve, write, check what Blender shows, and say what could not be done."""
+        """Resolve, write, check what Blender shows, and report what could not be done."""
         rigged, scene = Rigged.of(context), context.scene
         folder = cache_folder(settings, rigged) if settings.cloth_output == "CACHE" else None
         with _without_caches(rigged):
@@ -78,7 +78,7 @@ class LCOLLISION_OT_prepare_cloth(Stepped, bpy.types.Operator):
 
 
 def _verdict(frames: Frames, settings: bpy.types.PropertyGroup) -> str:
-    """Say how many frames a solver takes."""
+    """Return a sentence on how many frames are fit for cloth."""
     n, bad = len(frames.within), len(frames.colliding)
     between = counted(settings.cloth_subframes, "pose") + " between two"
     if bad:
@@ -87,7 +87,7 @@ def _verdict(frames: Frames, settings: bpy.types.PropertyGroup) -> str:
 
 
 def _reasons(resolved: Resolved, now: Frames) -> dict[int, str]:
-    """Say of each frame that is not fit why, by its number."""
+    """Return why each unfit frame is not fit, by its number."""
     numbers = resolved.frames.numbers
     told = {}
     for span in resolved.kept:
@@ -100,7 +100,7 @@ def _reasons(resolved: Resolved, now: Frames) -> dict[int, str]:
 
 
 def _lines(frames: Frames, why: dict[int, str]) -> list[str]:
-    """Say frame by frame what is not fit, and what does not count though a solver may see it."""
+    """List unfit frames, and pairs that do not count but that a solver may see."""
     lines = []
     for at in frames.within:
         number, found = frames.numbers[at], frames.found[at]
@@ -121,11 +121,11 @@ def _write_report(lines: list[str]) -> None:
 
 
 def cache_folder(settings: bpy.types.PropertyGroup, rigged: Rigged) -> Path:
-    """Return where caches are written.
+    """Return the folder for caches.
 
     Raises
     ------
-    SceneError : there is no such place, or a mesh takes no modifier.
+    SceneError : there is no such folder, or a mesh takes no modifier.
     """
     if settings.cloth_folder.startswith("//") and not bpy.data.filepath:
         raise SceneError("Save the file first, or choose a folder for the mesh caches")
@@ -142,7 +142,7 @@ def cache_folder(settings: bpy.types.PropertyGroup, rigged: Rigged) -> Path:
 
 @contextmanager
 def _without_caches(rigged: Rigged) -> Iterator[None]:
-    """Show the meshes as their bones move them; earlier caches only again if this fails."""
+    """Hide earlier caches, so that bones move the meshes; show them again only on failure."""
     caches = [item.modifiers[CACHE] for item in rigged.meshes if CACHE in item.modifiers]
     shown = [one for one in caches if one.show_viewport]
     for one in shown:
@@ -159,7 +159,7 @@ def _without_caches(rigged: Rigged) -> Iterator[None]:
 def _write_caches(
     scene: bpy.types.Scene, rigged: Rigged, resolved: Resolved, folder: Path
 ) -> Generator[str, None, dict[bpy.types.Object, Path]]:
-    """Write each mesh as it is shown in all frames, and between them, to a PC2 file.
+    """Write each mesh, as shown in all frames and between them, to a PC2 file.
 
     Returns
     -------
@@ -202,7 +202,7 @@ def _write_caches(
 
 
 def _show_caches(caches: dict[bpy.types.Object, Path], first: int, subframes: int) -> None:
-    """Let meshes be shown as their caches say."""
+    """Show the meshes by their caches."""
     for item, path in caches.items():
         cache = item.modifiers.get(CACHE) or item.modifiers.new(CACHE, "MESH_CACHE")
         cache.cache_format, cache.interpolation = "PC2", "LINEAR"
@@ -219,5 +219,5 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take it away."""
+    """Remove the operator."""
     bpy.utils.unregister_class(LCOLLISION_OT_prepare_cloth)

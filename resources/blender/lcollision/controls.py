@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The controls of a rig such as Rigify's: which of them turn which bones, and posing by them.
+"""The controls of a rig such as Rigify's: which bones each one turns, and posing by them.
 
-Constraints and drivers between controls and the bones that deform are Blender's to evaluate. So
-controls are found by turning each a little and looking what Blender makes of it.
+Blender evaluates the constraints and drivers between controls and deforming bones. So controls are
+found by turning each a little and reading the result.
 """
 
 import re
@@ -15,39 +15,39 @@ from mathutils import Matrix
 from .tree import Tree
 
 _SWITCH = "IK_FK"
-"""The property of Rigify's limbs that is 1 where they are posed by their FK controls."""
+"""The property of Rigify's limbs that is 1 when they are posed by their FK controls."""
 
 _PROBE, _WHOLE, _APART = 0.1, 0.9, 0.3
-"""Radians by which a control is turned, a share of them by which its own bone turns at least, and
-a share of the way of what hangs on it, by which that may be off."""
+"""Radians by which a control is turned; least share of that for its own bone's turn; largest error
+of the bones below it, as a share of their way."""
 
 _MOVED, _MOVED_BY_IK = 0.05, 0.75
-"""Shares of those radians by which no bone above it turns: IK twists what it poses along."""
+"""Shares of `_PROBE` above which a bone counts as turned; larger with IK, which twists others."""
 
 _OFF, _SHARE_OFF = 2e-3, 0.3
-"""By how much an IK chain may miss a bone's place: radians and lengths of the longest bone, or a
-share of the way there."""
+"""Largest error of an IK chain, in radians and lengths of the longest bone, or as a share of the
+way to its target."""
 
 _SAME = 1e-6
-"""Of a matrix: a control that is off by no more stays."""
+"""Tolerance of a matrix entry: a control that differs by no more is not moved."""
 
 State = dict[tuple[str, str], tuple[float, ...]]
-"""Numbers of properties of bones, by the names of the bones and paths from them."""
+"""Values of bone properties, by bone name and path from the bone."""
 
 
 @dataclass
 class Controls:
-    """Bones that do not deform, each of which turns a joint with all that hangs on it.
+    """Bones that do not deform, each of which turns a joint with everything that hangs on it.
 
     Attributes
     ----------
     armature : the object
     tree : of its J joints, the bones that move meshes
-    now : of each joint that has one the control that turns it, in limbs that IK poses its target
-    by_fk : of joints of limbs that IK may pose, the FK control
-    holders : of the controls of `by_fk` the bone that goes with them once the limb is switched
-    switches : of the same joints, the bone that has the limb's `_SWITCH`
-    locked : joints the control of which is locked
+    now : for each joint with one, the control that turns it; in limbs posed by IK, the target
+    by_fk : for joints of limbs that IK may pose, the FK control
+    holders : for the controls of `by_fk`, the bone that follows them once the limb is switched
+    switches : for the joints of `by_fk`, the bone with the limb's `_SWITCH`
+    locked : joints whose control is locked
     """
 
     armature: bpy.types.Object
@@ -60,11 +60,11 @@ class Controls:
 
     @classmethod
     def of(cls, armature: bpy.types.Object, tree: Tree) -> "Controls | None":
-        """Find the controls of a rig; None if no more than the root has one."""
+        """Find the controls of a rig; None if at most the root has one."""
         found, bones = cls(armature, tree), armature.pose.bones
         chosen = candidates(armature)
         switched = {bone.name: bone[_SWITCH] for bone in bones if _SWITCH in bone}
-        # By FK all that hangs on a joint goes with it.
+        # In FK, everything that hangs on a joint moves with it.
         for name in switched:
             found._switch_on(name)
         try:
@@ -96,7 +96,7 @@ class Controls:
 
     @property
     def joints(self) -> set[int]:
-        """The joints that controls turn, but for locked ones."""
+        """The joints that unlocked controls turn."""
         return (set(self.now) | set(self.by_fk)) - self.locked
 
     @property
@@ -113,7 +113,7 @@ class Controls:
         return [(name, f'["{_SWITCH}"]') for name in dict.fromkeys(self.switches.values())]
 
     def state(self) -> State:
-        """Return what the controls are turned and moved by, and the limbs' switches."""
+        """Return the rotations and locations of the controls, and the limbs' switches."""
         paths = [
             (name, path)
             for name in self.names
@@ -126,11 +126,11 @@ class Controls:
         return self.armature.pose.bones[switch][_SWITCH] >= 1.0
 
     def _probed(self, chosen: list[str], least: float) -> dict[int, str]:
-        """Turn each candidate a little; return the controls of joints as the rig is.
+        """Turn each candidate a little; return the joints' controls in the rig's present state.
 
         Parameters
         ----------
-        least : share of that turn by which no joint above one turns
+        least : share of the turn above which a joint counts as turned
         """
         self._update()
         before, own = self._joints(), self._matrices(chosen)
@@ -140,7 +140,7 @@ class Controls:
             bone = self.armature.pose.bones[name]
             path = rotation_path(bone)
             rotation = value_of(bone, path)
-            # About an axis across the bone: rigs spread twists over a limb.
+            # Turn about an axis across the bone: rigs distribute twists over a limb.
             set_rotation(bone, bone.matrix_basis @ Matrix.Rotation(_PROBE, 4, "X"))
             self._update()
             after, (turned,) = self._joints(), self._matrices([name])
@@ -159,7 +159,7 @@ class Controls:
         below: list[np.ndarray],
         least: float,
     ) -> int | None:
-        """Return the joint that turns as a control does, with all that hangs on it and no other."""
+        """Return the joint that turns like a control, with all that hangs on it and no other."""
         angles = _angles(before, after) / _PROBE
         is_moved, parents = angles > least, self.tree.parents
         tops = [
@@ -174,7 +174,7 @@ class Controls:
         return None if (off > _APART * ways.max(initial=0.0)).any() else int(tops[0])
 
     def _below(self) -> list[np.ndarray]:
-        """Return the joints that hang on each, however far down."""
+        """Return all joints below each joint."""
         n = len(self.tree.bones)
         hangs = np.zeros((n, n), np.bool_)
         for at, above in enumerate(self.tree.parents.tolist()):
@@ -184,7 +184,7 @@ class Controls:
         return [np.flatnonzero(column) for column in hangs.T]
 
     def _holder(self, control: str) -> str | None:
-        """Return the bone that takes a control's place where the limb is switched to it."""
+        """Return the bone that copies a control's transforms once the limb is switched to it."""
         for bone in self.armature.pose.bones:
             for one in bone.constraints:
                 if one.type == "COPY_TRANSFORMS" and one.subtarget == control:
@@ -206,7 +206,7 @@ class Controls:
         return None
 
     def _switch_on(self, name: str) -> None:
-        """Let a limb be posed by FK."""
+        """Switch a limb to FK."""
         bone = self.armature.pose.bones[name]
         bone[_SWITCH] = type(bone[_SWITCH])(1)
 
@@ -222,23 +222,23 @@ class Controls:
         return self._matrices(self.tree.bones)
 
     def jumping(self, by_fk: set[str]) -> set[tuple[str, str]]:
-        """Return the properties that mean nothing where limbs are not switched to FK."""
+        """Return the properties that have no effect unless limbs are switched to FK."""
         names = {name for joint, name in self.by_fk.items() if self.switches[joint] in by_fk}
         keys = [key for key in self.state() if key[0] in names]
         return {*keys, *(key for key in self.switch_paths() if key[0] in by_fk)}
 
     def place(self, targets: np.ndarray, by_fk: set[str]) -> set[str]:
-        """Pose the controls so that the joints come to (J, 4, 4) transforms.
+        """Pose the controls so that the joints reach (J, 4, 4) transforms.
 
-        A limb that IK poses keeps its IK, by its target, where that brings its joints there.
+        A limb posed by IK keeps its IK if moving the target brings its joints there.
 
         Parameters
         ----------
-        by_fk : bones of the switches of limbs that are switched to FK in any case
+        by_fk : switch bones of limbs that are switched to FK in any case
 
         Returns
         -------
-        by_fk : of all limbs that were switched
+        by_fk : switch bones of all limbs that were switched
         """
         self._update()
         starts = self._joints()
@@ -263,7 +263,7 @@ class Controls:
         state = self.state()
         self._place(wanted(kept, None))
         now, longest = self._joints(), max(one.length for one in self.armature.data.bones)
-        # How a limb is twisted within, IK does not say.
+        # IK does not determine the twist within a limb.
         has_target = np.isin(np.arange(len(targets)), list(self.now))
         wants, misses = (
             np.maximum(
@@ -280,14 +280,14 @@ class Controls:
                 by_fk.add(switch)
         for name in by_fk - were:
             self._switch_on(name)
-        # What poses them by IK stays as it was.
+        # The IK controls of switched limbs stay as they were.
         left = {name for joint, name in kept.items() if self.switches.get(joint) in by_fk}
         put_state(self.armature, {key: one for key, one in state.items() if key[0] in left})
         self._place(wanted(self.by_fk, by_fk))
         return by_fk - were
 
     def _place(self, wanted: dict[int, tuple[str, np.ndarray]]) -> None:
-        """Bring controls, of joints, to their matrices: from the trunk outwards."""
+        """Move the controls of joints to their matrices, from the trunk outwards."""
         depth: list[int] = []
         for above in self.tree.parents.tolist():
             depth.append(0 if above < 0 else depth[above] + 1)
@@ -323,7 +323,7 @@ class Controls:
 
 
 def candidates(armature: bpy.types.Object) -> list[str]:
-    """Return the names of bones that may be controls, those that are locked among them."""
+    """Return the names of bones that may be controls, including locked ones."""
     data = armature.animation_data
     driven = set() if data is None else {one.data_path for one in data.drivers}
     found = []
@@ -335,12 +335,12 @@ def candidates(armature: bpy.types.Object) -> list[str]:
             continue
         if not any(locks) or (all(locks) and bone.custom_shape is not None):
             found.append(bone.name)
-    # Of two that turn the same, the lower one is the bone's own.
+    # Of two controls that turn the same bone, the lower one, probed later, wins.
     return sorted(found, key=lambda name: len(armature.data.bones[name].parent_recursive))
 
 
 def _angles(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return by how many radians (J, 4, 4) transforms are turned against others."""
+    """Return the angles in radians between two sets of (J, 4, 4) transforms."""
     axes = [
         one[:, :3, :3] / np.linalg.norm(one[:, :3, :3], axis=1)[:, None] for one in (before, after)
     ]
@@ -355,12 +355,12 @@ def whole_path(bone: bpy.types.PoseBone, path: str) -> str:
 
 
 def value_of(bone: bpy.types.PoseBone, path: str) -> tuple[float, ...]:
-    """Return the numbers of a bone's property, of its own or of the user's, as '["name"]'."""
+    """Return the values of a bone's property, built-in or custom ('["name"]')."""
     return (bone.path_resolve(path),) if path.startswith("[") else tuple(getattr(bone, path))
 
 
 def put_value(bone: bpy.types.PoseBone, path: str, value: tuple[float, ...]) -> None:
-    """Give a bone's property numbers."""
+    """Set the values of a bone's property."""
     if path.startswith("["):
         name = path[2:-2]
         bone[name] = type(bone[name])(value[0])
@@ -369,12 +369,12 @@ def put_value(bone: bpy.types.PoseBone, path: str, value: tuple[float, ...]) -> 
 
 
 def state_of(armature: bpy.types.Object, paths: list[tuple[str, str]]) -> State:
-    """Return what properties, by names of bones and paths, are."""
+    """Return the values of properties, given by bone names and paths."""
     return {(name, path): value_of(armature.pose.bones[name], path) for name, path in paths}
 
 
 def put_state(armature: bpy.types.Object, state: State) -> None:
-    """Let properties be what they were."""
+    """Restore the values of properties."""
     for (name, path), value in state.items():
         put_value(armature.pose.bones[name], path, value)
 
@@ -386,10 +386,10 @@ def rotation_path(bone: bpy.types.PoseBone) -> str:
 
 
 def set_rotation(bone: bpy.types.PoseBone, matrix: Matrix) -> None:
-    """Write a rotation in the bone's own mode, near what it has."""
+    """Set a rotation in the bone's own mode, near its present values."""
     turn = matrix.to_quaternion()
     if bone.rotation_mode == "QUATERNION":
-        # Of the two signs, that of the keys there are.
+        # Choose the sign that matches the existing keys.
         turn.make_compatible(bone.rotation_quaternion)
         bone.rotation_quaternion = turn
     elif bone.rotation_mode == "AXIS_ANGLE":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The faces that collide, drawn over the mesh in colours."""
+"""Colliding faces, drawn over the mesh in colours."""
 
 import bpy
 import numpy as np
@@ -9,24 +9,24 @@ _GREY = np.array([0.5, 0.5, 0.5, 0.4])
 PROPOSED = np.array([0.1, 0.4, 1.0, 0.6])
 
 _corners = np.empty((0, 3))
-"""(3 n, 3) corners of the triangles, in the world."""
+"""(3 n, 3) corners of the triangles, in world coordinates."""
 _colours = np.empty((0, 4))
-"""(n, 4) of the triangles."""
+"""(n, 4) colours of the triangles."""
 _objects: frozenset[str] = frozenset()
-"""The names of those of which one must be active."""
+"""Names of objects; the triangles are shown while one of them is active."""
 _is_grey = False
 
 _handler = None
 
 
 def by_depth(depths: np.ndarray) -> np.ndarray:
-    """Return (n, 4) colours of (n,) depths: from yellow to red, which is that of the deepest."""
+    """Return (n, 4) colours of (n,) depths, from yellow to red for the deepest."""
     share = (depths / max(depths.max(initial=0.0), np.finfo(float).tiny))[:, None]
     return _SHALLOW + share * (_DEEP - _SHALLOW)
 
 
 def show(corners: np.ndarray, colours: np.ndarray, objects: set[str]) -> None:
-    """Show (3 n, 3) corners of triangles in (n, 4) colours, while one of some objects is active."""
+    """Show triangles by (3 n, 3) corners in (n, 4) colours, while one of `objects` is active."""
     global _corners, _colours, _objects, _is_grey
     _corners, _colours, _objects, _is_grey = corners, colours, frozenset(objects), False
     _redraw()
@@ -38,20 +38,20 @@ def clear() -> None:
 
 
 def grey(is_grey: bool) -> None:
-    """Show the faces in grey, or in their own colours again."""
+    """Show the faces in grey or in their own colours."""
     global _is_grey
     _is_grey = is_grey
     _redraw()
 
 
 def shown() -> np.ndarray:
-    """Return the corners that are shown."""
+    """Return the corners that are shown now."""
     active = bpy.context.view_layer.objects.active
     return _corners if active is not None and active.name in _objects else _corners[:0]
 
 
 def colours() -> np.ndarray:
-    """Return the (n, 4) colours in which triangles are shown."""
+    """Return the (n, 4) colours of the shown triangles."""
     return np.broadcast_to(_GREY, _colours.shape) if _is_grey else _colours
 
 
@@ -85,6 +85,6 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Draw no more."""
+    """Stop drawing."""
     bpy.types.SpaceView3D.draw_handler_remove(_handler, "WINDOW")
     clear()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What was found last: in the panel and over the mesh, for as long as it is of what is shown."""
+"""The last results, shown in the panel and over the mesh while they apply to what is shown."""
 
 from dataclasses import dataclass
 
@@ -11,19 +11,19 @@ from . import drawing
 from .scene import Rigged, SceneError
 
 MARKER = "collides"
-"""The name of the markers of frames that collide."""
+"""Name of the markers of colliding frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A character as it is shown at one time.
+    """A character as shown at one time.
 
     Attributes
     ----------
     scene, armature, meshes : names
     transforms : (J, 4, 4) of the bones
     vertices : (W, 3)
-    world : (4, 4) from the armature's frame
+    world : (4, 4) from the armature's coordinates
     """
 
     scene: str
@@ -35,7 +35,7 @@ class Shown:
 
     @classmethod
     def of(cls, rigged: Rigged) -> "Shown":
-        """Read what is shown now."""
+        """Read the character as shown now."""
         return cls(
             bpy.context.scene.name,
             rigged.armature.name,
@@ -46,7 +46,7 @@ class Shown:
         )
 
     def is_of(self, rigged: Rigged) -> bool:
-        """Return whether a character is shown as it was then."""
+        """Return whether a character is still shown like this."""
         names = (bpy.context.scene.name, rigged.armature.name)
         return (
             names == (self.scene, self.armature)
@@ -57,16 +57,16 @@ class Shown:
 
 
 _shown: Shown | None = None
-"""What the faces over the mesh and the verdict on a pose are of."""
+"""The character to which the drawn faces and the verdict on a pose apply."""
 _reply: dict | None = None
-"""Of the check that found them; None of what is shown else."""
+"""The check that found these faces; None for faces of another origin."""
 _is_looking = False
 is_stale = False
-"""Whether something else is shown since, which the live check is about to look at."""
+"""Whether the pose has changed since, and the live check will soon check it."""
 
 
 def show(rigged: Rigged, reply: dict, shown: Shown) -> None:
-    """Show what a check of `shown` has found, in the panel and over the mesh."""
+    """Show the result of a check of `shown`, in the panel and over the mesh."""
     global _reply
     _say(rigged, reply)
     pairs = _array(reply["faces"]).reshape(-1, 2)
@@ -86,7 +86,7 @@ def _say(rigged: Rigged, reply: dict) -> None:
 
 
 def tint(rigged: Rigged, faces: np.ndarray, colours: np.ndarray, shown: Shown) -> None:
-    """Show some faces in (n, 4) colours, in place of what was shown before."""
+    """Show faces in (n, 4) colours, replacing those shown before."""
     global _shown, _reply, is_stale
     triangles, world = rigged.triangles(), shown.world
     is_there = faces < len(triangles)
@@ -97,7 +97,7 @@ def tint(rigged: Rigged, faces: np.ndarray, colours: np.ndarray, shown: Shown) -
 
 
 def clear() -> None:
-    """Show nothing, and take the verdict on the pose back."""
+    """Show no faces, and withdraw the verdict on the pose."""
     global _shown, _reply, is_stale
     _shown, _reply, is_stale = None, None, False
     drawing.clear()
@@ -107,7 +107,7 @@ def clear() -> None:
 
 
 def clear_frames(scene: bpy.types.Scene) -> None:
-    """Take the list of colliding frames and their markers away; the user's own markers stay."""
+    """Clear the list of colliding frames and their markers; the user's own markers stay."""
     markers, frames = scene.timeline_markers, scene.lcollision.frames
     listed = {item.frame for item in frames}
     for marker in [one for one in markers if one.name == MARKER and one.frame in listed]:
@@ -116,11 +116,11 @@ def clear_frames(scene: bpy.types.Scene) -> None:
 
 
 def refresh() -> None:
-    """Take back what is no longer so; in grey where the live check is about to look again."""
+    """Withdraw outdated results, or show them in grey if the live check will update them."""
     global is_stale
     settings = bpy.context.scene.lcollision
     if _shown is None:
-        # An undo and a file bring the verdict back, not what it was of.
+        # Undo and loading a file bring back the verdict, but not its subject.
         if settings.is_of_pose:
             settings.forget()
         return
@@ -130,7 +130,7 @@ def refresh() -> None:
     except SceneError:
         is_so = False
     if is_so and _reply is not None and not settings.is_of_pose:
-        # An undo takes it away as well.
+        # Undo removes the verdict, too: restore it.
         _say(rigged, _reply)
     if not is_so and not settings.live:
         clear()
@@ -142,7 +142,7 @@ def refresh() -> None:
 @persistent
 def _on_change(*_: object) -> None:
     global _is_looking
-    # A render has frames of its own.
+    # A render changes frames by itself.
     if _is_looking or bpy.app.is_job_running("RENDER"):
         return
     _is_looking = True
@@ -169,7 +169,7 @@ class LCOLLISION_OT_clear(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set:
-        """Clear it."""
+        """Clear all results."""
         clear()
         context.scene.lcollision.forget()
         clear_frames(context.scene)
@@ -186,7 +186,7 @@ class LCOLLISION_OT_jump(bpy.types.Operator):
     is_back: bpy.props.BoolProperty(name="Previous")
 
     def execute(self, context: bpy.types.Context) -> set:
-        """Go there."""
+        """Go to the frame."""
         scene = context.scene
         frames = [item.frame for item in scene.lcollision.frames]
         if self.is_back:
@@ -211,7 +211,7 @@ def _handlers() -> tuple:
 
 
 def register() -> None:
-    """Add the operators, and follow what changes."""
+    """Add the operators and the handlers of changes."""
     for one in _CLASSES:
         bpy.utils.register_class(one)
     for handlers, own in _handlers():
@@ -219,7 +219,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take all of it away."""
+    """Remove the operators, the handlers and the drawn faces."""
     global _shown, is_stale
     _shown, is_stale = None, False
     drawing.clear()

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Keys of F-curves: other values in spans of frames, and all other frames as they were, to the bit.
+"""Keys of F-curves: new values in spans of frames, while all other frames stay bit-identical.
 
-Blender rounds as it evaluates a curve, and a part of a Bezier curve is rounded otherwise than the
-whole. So a curve that is cut between two keys is split exactly (de Casteljau) and evaluated again.
-Where a frame is off by a bit, last bits of the handles are tried, then a key with the old value.
+Blender rounds when it evaluates a curve, and a part of a Bezier curve is rounded differently from
+the whole. So a curve that is cut between two keys is split exactly (de Casteljau) and evaluated
+again. If a frame is off by a bit, the last bits of the handles are varied, then a key with the old
+value is added.
 """
 
 from functools import cache
@@ -18,7 +19,7 @@ _ENUMS = bpy.types.Keyframe.bl_rna.properties
 
 
 def _number(name: str, item: str) -> int:
-    """Return the number of an enumeration's item, as arrays of keys have it."""
+    """Return the number of an enumeration's item, as used in arrays of keys."""
     return _ENUMS[name].enum_items[item].value
 
 
@@ -40,10 +41,10 @@ _NEW["interpolation"] = _LINEAR
 _NEW["handle_left_type"] = _NEW["handle_right_type"] = _VECTOR
 
 _N_TRIALS = 300
-"""Of last bits of handles, before a curve gets one more key."""
+"""Number of trials of handles' last bits before a curve gets one more key."""
 
 _AT = 1e-4
-"""Frames by which a key may be off a frame and is still the one that Blender shows there."""
+"""Tolerance, in frames, for a key to be at a frame."""
 
 
 def curves_of(action: bpy.types.Action, item: bpy.types.Object) -> list[bpy.types.FCurve]:
@@ -51,7 +52,7 @@ def curves_of(action: bpy.types.Action, item: bpy.types.Object) -> list[bpy.type
     slot = getattr(item.animation_data, "action_slot", None)
     if slot is None:
         return list(getattr(action, "fcurves", ()))
-    # Where there are slots, an action's own curves, if it has any, are those of the first alone.
+    # With slots, an action's own `fcurves`, if it has any, are only those of the first slot.
     strips = (strip for layer in action.layers for strip in layer.strips)
     bags = (strip.channelbag(slot) for strip in strips)
     return [curve for bag in bags if bag is not None for curve in bag.fcurves]
@@ -74,7 +75,7 @@ def check_keyable(rigged: Rigged) -> None:
 
 
 def unkeyable_bones(rigged: Rigged, numbers: list[int] | None = None) -> dict[str, str]:
-    """Return the deforming bones to whose rotation keys cannot be given, and why.
+    """Return the deforming bones whose rotation cannot be keyed, and why.
 
     Parameters
     ----------
@@ -92,7 +93,7 @@ def unkeyable_bones(rigged: Rigged, numbers: list[int] | None = None) -> dict[st
         own = []
         for writer in rigged.writers(joint):
             bone = rigged.armature.pose.bones[writer]
-            # Only roots are moved, too, and what poses a limb by IK.
+            # Only roots and controls also move.
             is_moved = parent < 0 or rigged.controls is not None
             for path in (rotation_path(bone), *(("location",) if is_moved else ())):
                 own += curves.get(bone.path_from_id(path), ())
@@ -103,7 +104,7 @@ def unkeyable_bones(rigged: Rigged, numbers: list[int] | None = None) -> dict[st
 
 
 def _why_unkeyable(curve: bpy.types.FCurve, numbers: list[int]) -> str:
-    """Return why keys of a curve would not be shown as they are, "" if they are."""
+    """Return why keys of a curve would not be shown unchanged, or ""."""
     if curve.lock or (curve.group is not None and curve.group.lock):
         return "locked curves"
     if curve.mute or (curve.group is not None and curve.group.mute):
@@ -112,7 +113,7 @@ def _why_unkeyable(curve: bpy.types.FCurve, numbers: list[int]) -> str:
         return "sampled curves"
     first, last = curve.range()
     for one in curve.modifiers:
-        # Within its keys a cycle is the curve itself.
+        # Between its keys, a cycle equals the curve itself.
         is_itself = one.type == "CYCLES" and first <= numbers[0] and numbers[-1] <= last
         if not one.mute and not is_itself:
             return f"curves with the modifier {one.type.capitalize()}"
@@ -133,11 +134,11 @@ def rekey(
     Parameters
     ----------
     curves : C, of its components
-    is_new : (C,) whether a curve was made for this: its keys do not count
+    is_new : (C,) whether a curve was newly made: its keys do not count
     numbers : T consecutive frames
-    before, after : (T, C) float32 values as they were, and as they are to be within the spans
-    spans : places in the frames, apart from each other, and by how much curves may be off there
-    is_jump : whether the curve jumps into the spans and out of them, not from frame to frame
+    before, after : (T, C) float32 values before, and the wanted ones within the spans
+    spans : disjoint spans of frame indices, each with the tolerance of the curves
+    is_jump : whether the curve jumps into and out of the spans
     """
     old = [_NEW_KEYS if new else _read(one) for one, new in zip(curves, is_new, strict=True)]
     fits = [_fitted(after[span.start : span.stop], least) for span, least in spans]
@@ -151,7 +152,7 @@ def rekey(
         regions = []
         for (span, _), (places, handles) in zip(spans, fits, strict=True):
             left, right = numbers[span.start] - 1, numbers[span.stop - 1] + 1
-            # Frames that nothing is keyed in beyond show the outermost key.
+            # Beyond the keyed frames, the outermost key is shown.
             at = np.array(places) + span.start
             inner = _curved(np.array(numbers)[at], after[at, column], handles[..., column])
             if is_jump:
@@ -177,7 +178,7 @@ def _frames(keys: np.ndarray) -> range:
 
 
 def _curved(numbers: np.ndarray, values: np.ndarray, handles: np.ndarray) -> np.ndarray:
-    """Return k keys between which a curve has (k - 1, 2) values of handles."""
+    """Return k keys of a Bezier curve with (k - 1, 2) values of handles between them."""
     keys = np.full(len(numbers), _NEW)
     third = np.diff(numbers) / 3.0
     keys["co"] = np.stack([numbers, values], axis=1)
@@ -190,16 +191,16 @@ def _curved(numbers: np.ndarray, values: np.ndarray, handles: np.ndarray) -> np.
 
 
 def _fitted(values: np.ndarray, tolerance: float) -> tuple[list[int], np.ndarray]:
-    """Find the fewest keys between which Bezier curves are near (n, C) values.
+    """Fit Bezier curves with few keys, greedily, to (n, C) values.
 
     Parameters
     ----------
-    tolerance : by how much the curves are less off, over all components together
+    tolerance : bound of the error, as a norm over the components
 
     Returns
     -------
-    places : of k keys
-    handles : (k - 1, 2, C) values of the handles between two keys, at thirds of the way
+    places : indices of k keys
+    handles : (k - 1, 2, C) values of the handles between two keys, at thirds of the interval
     """
     values, last = values.astype(np.float64), len(values) - 1
     places, handles = [0], []
@@ -217,9 +218,9 @@ def _fitted(values: np.ndarray, tolerance: float) -> tuple[list[int], np.ndarray
 
 
 def _cubic(values: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the (2, C) handles of the curve nearest to (n, C) values, and by how much it is off.
+    """Return the (2, C) handles of the curve nearest to (n, C) values, and its largest error.
 
-    It goes through the first and the last.
+    The curve passes through the first and the last value.
     """
     weights, inverse = _handle_weights(len(values))
     way = values[-1] - values[0]
@@ -231,7 +232,7 @@ def _cubic(values: np.ndarray) -> tuple[np.ndarray, float]:
 
 @cache
 def _handle_weights(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (n, 2) weights that two handles have at even times, and their inverse."""
+    """Return the (n, 2) weights of two handles at n evenly spaced times, and their inverse."""
     time = np.linspace(0.0, 1.0, n)
     weights = 3.0 * np.stack([time * (1.0 - time) ** 2, time**2 * (1.0 - time)], axis=1)
     return weights, np.linalg.pinv(weights)
@@ -263,16 +264,16 @@ def _rewrite(
     values: dict[int, float],
     way_in: int,
 ) -> None:
-    """Put keys into regions of a curve, and leave its other frames as they are.
+    """Put keys into regions of a curve without changing its other frames.
 
     Parameters
     ----------
-    regions : the frames on either side of each, which stay; infinite where there is none; its keys
-    values : of all frames outside of the regions
+    regions : for each, the frames on either side, which stay (infinite if none), and its keys
+    values : of all frames outside the regions
     way_in : the interpolation of keys from which a region is entered
     """
     extra: set[int] = set()
-    # Of parts of Bezier curves, by their times, the (2, 2) handles.
+    # The (2, 2) handles of parts of Bezier curves, by their times.
     handles: dict[tuple[float, float], np.ndarray] = {}
     while True:
         keys = _hold(curve, *_laid(old, regions, extra, values, handles, way_in))
@@ -293,7 +294,7 @@ def _rewrite(
 
 
 def _nudged(curve: bpy.types.FCurve, at: int, wanted: dict[int, float]) -> tuple[np.ndarray, bool]:
-    """Move the handles between two keys by some last bits, until the frames between are right.
+    """Vary the last bits of the handles between two keys, until the frames between are right.
 
     Returns
     -------
@@ -313,11 +314,11 @@ def _nudged(curve: bpy.types.FCurve, at: int, wanted: dict[int, float]) -> tuple
 
 
 def _hold(curve: bpy.types.FCurve, keys: np.ndarray, is_new: np.ndarray) -> np.ndarray:
-    """Write keys, and free those handles that Blender moves as they have other neighbours.
+    """Write keys, and set handles to free if Blender would move them for their new neighbours.
 
     Returns
     -------
-    keys : as they are held
+    keys : as written
     """
     _write(curve, keys)
     is_bezier = keys["interpolation"] == _BEZIER
@@ -382,7 +383,7 @@ def _split(
     regions: list[tuple],
     handles: dict[tuple[float, float], np.ndarray],
 ) -> None:
-    """Give keys that cut a curve the shape that the curve had there."""
+    """Give the parts of a cut curve the shape that the curve had there."""
     times = old["co"][:, 0].astype(np.float64)
     for at in range(len(keys) - 1):
         begin, end = keys["co"][at : at + 2, 0].astype(np.float64)
@@ -404,12 +405,12 @@ def _split(
             keys["handle_right"][at], keys["handle_left"][at + 1] = part
             keys["handle_right_type"][at] = keys["handle_left_type"][at + 1] = _FREE
         elif kind not in (_LINEAR, _CONSTANT):
-            # No part of an easing is one: its frames get keys.
+            # A part of an easing curve is not one itself: its frames get keys.
             keys["interpolation"][at] = _LINEAR
 
 
 def _shape(one: np.void, other: np.void) -> np.ndarray:
-    """Return the (4, 2) control points between two keys, as Blender shortens their handles."""
+    """Return the (4, 2) control points between two keys, with handles shortened as by Blender."""
     shape = np.array([one["co"], one["handle_right"], other["handle_left"], other["co"]], float)
     room = shape[3, 0] - shape[0, 0]
     for end, handle in ((0, 1), (3, 2)):
@@ -420,7 +421,7 @@ def _shape(one: np.void, other: np.void) -> np.ndarray:
 
 
 def _parameter(times: np.ndarray, time: float) -> float:
-    """Return where on a curve, of (4,) times that rise, a time is."""
+    """Return the parameter of a time on a curve with (4,) ascending times."""
     low, high = 0.0, 1.0
     for _ in range(60):
         middle = 0.5 * (low + high)

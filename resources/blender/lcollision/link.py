@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The engine's process, started when it is first asked."""
+"""The engine's process, started on the first request."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from .found import Shown
 from .scene import Rigged, SceneError
 
 Steps = Iterator[str]
-"""Says before each step what is done; "\\0" first where there is nothing to do but wait."""
+"""Yields a text before each step; it starts with "\\0" if the step only waits."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class Opened:
 
     Attributes
     ----------
-    engine : that
-    key : what it was opened as, of `Rigged.key`
+    engine : the engine
+    key : its `Rigged.key` when it was opened
     rules : that differ from its own
     n_vertices : of each mesh at rest, by name
-    answer : the engine's
+    answer : the engine's, to `open_mesh`
     """
 
     engine: Engine
@@ -40,7 +40,7 @@ class Opened:
     answer: dict
 
     def send(self, kind: str, progress: Told | None = None, **values: object) -> Request:
-        """Ask about the character without waiting: see `Engine.send`."""
+        """Send a request about the character without waiting: see `Engine.send`."""
         return self.engine.send(kind, progress, character=self.answer["character"], **values)
 
     def check(
@@ -50,7 +50,7 @@ class Opened:
         shown: Shown | None = None,
         before: Shown | None = None,
     ) -> Request:
-        """Ask about the pose that is shown, or that was, and about the linear path from another."""
+        """Request a check of a pose, by default the shown one, and of the linear path to it."""
         shown = shown or Shown.of(rigged)
         self.require_same_meshes(rigged, len(shown.vertices))
         return self.send(
@@ -62,11 +62,11 @@ class Opened:
         )
 
     def require_same_meshes(self, rigged: Rigged, n_vertices: int) -> None:
-        """Require that the meshes are shown with as many vertices as they have at rest.
+        """Require that the meshes are shown with as many vertices as at rest.
 
         Raises
         ------
-        SceneError : a modifier makes another mesh of the pose.
+        SceneError : a modifier changes the mesh from pose to pose.
         """
         if n_vertices == self.answer["vertices"]:
             return
@@ -82,18 +82,18 @@ class Opened:
         raise SceneError(f"The meshes of {rigged.armature.name} have changed; try again")
 
     def clearance(self, rigged: Rigged, length: float | None = None) -> float:
-        """Return a length of the scene, by default the panel's clearance, in body sizes."""
+        """Convert a length of the scene, by default the panel's clearance, to body sizes."""
         size = self.answer["body_size"] * rigged.world_size()
         return (bpy.context.scene.lcollision.clearance if length is None else length) / size
 
 
 _engine: Engine | None = None
 _opened: dict[str, Opened] = {}
-"""Of each armature by name, what it was last opened as."""
+"""The last opened character of each armature, by name."""
 _own_rules: dict[str, dict] = {}
-"""Of each character that is open in the engine by its hash, the rules that it came with."""
+"""The original rules of each character open in the engine, by its hash."""
 n_going_on = 0
-"""Operators that go on in a window: what they have opened is not closed meanwhile."""
+"""Number of running modal operators: characters are not closed meanwhile."""
 
 
 _lock = threading.Lock()
@@ -103,7 +103,7 @@ _failed: list[EngineError] = []
 
 
 def is_ready() -> bool:
-    """Return whether the engine runs; if it does not, start it beside, without waiting.
+    """Return whether the engine runs; if not, start it in a thread without waiting.
 
     Raises
     ------
@@ -141,7 +141,7 @@ def engine() -> Engine:
         stop()
         n_stops = _n_stops
         python = _engine_python()
-        # Blender's own settings of Python are not the engine's.
+        # Blender's PYTHONHOME does not apply to the engine.
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONHOME"}
         try:
             started = Engine.start([python, "-P", "-m", "app"], env=environment)
@@ -158,7 +158,7 @@ def engine() -> Engine:
 
 
 def _engine_python() -> str:
-    """Return the Python that has the engine."""
+    """Return the path of the Python interpreter that has the engine."""
     path = Path(__file__).with_name("engine.json")
     try:
         python = json.loads(path.read_text(encoding="utf-8"))["python"]
@@ -173,7 +173,7 @@ def _engine_python() -> str:
 
 
 def stop() -> None:
-    """End the engine, if it runs, without waiting: it has nothing to save."""
+    """End the engine, if it runs, without waiting; it has nothing to save."""
     global _engine, _n_stops
     _n_stops += 1
     forget()
@@ -184,7 +184,7 @@ def stop() -> None:
 
 
 def forget() -> None:
-    """Take no armature for one that was opened before."""
+    """Forget all opened characters."""
     _opened.clear()
 
 
@@ -195,8 +195,8 @@ def waited(
 
     Parameters
     ----------
-    engine : that has been asked
-    progress : of which the last two entries are how much is done of how much
+    engine : that the request was sent to
+    progress : list whose last two entries are the done and the total amount
     """
     try:
         while not request.is_done:
@@ -212,14 +212,14 @@ def waited(
 def opening(
     rigged: Rigged, rules: dict, poses: np.ndarray | None = None
 ) -> Generator[str, None, Opened]:
-    """Start the engine if it does not run, and open a character as it is now, with these rules.
+    """Start the engine if it does not run, and open the present character with these rules.
 
-    It takes the place of what its armature was before, which the engine then forgets.
+    It replaces the armature's earlier character, which the engine then closes.
 
     Parameters
     ----------
     rules : added to the character's own
-    poses : (N, J, 4, 4) transforms of the bones in a motion, which says how far they turn
+    poses : (N, J, 4, 4) transforms of the bones in a motion, which show how far they turn
 
     Raises
     ------
@@ -250,7 +250,7 @@ def opening(
 
 
 def known(rigged: Rigged, rules: dict) -> Opened | None:
-    """Return a character that was opened before and has not changed, with these rules."""
+    """Return the opened character if it has not changed and has these rules, else None."""
     found = _opened.get(rigged.armature.name)
     if found is None or not found.engine.is_alive:
         return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The check while posing: the newest pose wins, and the interface never waits for the engine."""
+"""The live check: the newest pose wins, and the interface never waits for the engine."""
 
 import bpy
 from bpy.app.handlers import persistent
@@ -9,23 +9,23 @@ from .client import EngineError, Request
 from .scene import Rigged, SceneError
 
 _EVERY = 0.05
-"""Seconds between two looks."""
+"""Seconds between two polls."""
 
 _is_on = False
 _is_newer = False
 _asked: Request | None = None
 _shown: found.Shown | None = None
 _opening: link.Steps | None = None
-"""What is being asked and of what, and the steps of opening the character if it is that."""
+"""The pending check and the character it applies to, or the steps of opening the character."""
 
 
 def is_on() -> bool:
-    """Return whether it looks."""
+    """Return whether the live check is on."""
     return _is_on
 
 
 def switch(on: bool) -> None:
-    """Begin or end looking."""
+    """Turn the live check on or off."""
     global _is_on, _is_newer, _asked, _opening
     if on == _is_on:
         return
@@ -38,28 +38,28 @@ def switch(on: bool) -> None:
             bpy.app.timers.register(_look)
         return
     drawing.clear()
-    # Blender takes it away itself where a file is loaded.
+    # Blender removes the handler itself when a file is loaded.
     if _on_update in handlers:
         handlers.remove(_on_update)
 
 
 @persistent
 def _on_load(*_: object) -> None:
-    """Let go of the scene that was there before, and look at the new one if it wants that."""
+    """Forget the previous file's scene, and turn the check on if the new scene has it on."""
     switch(False)
     link.forget()
     switch(bpy.context.scene.lcollision.looks)
 
 
 def register() -> None:
-    """Follow the files that are loaded, and go on where the add-on was disabled meanwhile."""
+    """Follow loaded files, and resume the check if it was on when the add-on was disabled."""
     bpy.app.handlers.load_post.append(_on_load)
     # Scenes cannot be read yet.
     bpy.app.timers.register(_on_load, first_interval=0.0)
 
 
 def unregister() -> None:
-    """End looking, as the add-on goes."""
+    """Remove the handlers, and turn the live check off."""
     bpy.app.handlers.load_post.remove(_on_load)
     if bpy.app.timers.is_registered(_on_load):
         bpy.app.timers.unregister(_on_load)
@@ -87,21 +87,21 @@ def _look() -> float | None:
 
 
 def look() -> bool:
-    """Take the answer that has come, and ask about the newest pose if no answer is on its way.
+    """Show a received answer, and request a check of the newest pose if none is pending.
 
     Returns
     -------
-    is_current : whether what is shown is of the newest pose
+    is_current : whether the shown result is that of the newest pose
     """
     global _asked, _shown, _opening, _is_newer
     if not link.is_ready() or (_asked is not None and not _asked.is_done):
         return False
-    # Objects that an undo took away must not be kept: they are looked up anew.
+    # Undo invalidates references to objects: look them up anew.
     rigged = Rigged.of(bpy.context)
     rules = bpy.context.scene.lcollision.chosen_rules(rigged)
     known = link.known(rigged, rules)
     if _opening is not None:
-        # Another may have opened it meanwhile.
+        # An operator may have opened it meanwhile.
         if known is None and next(_opening, None) is not None:
             return False
         _opening, known = None, link.known(rigged, rules)

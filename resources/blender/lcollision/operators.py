@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the panel's buttons do."""
+"""The operators for poses, and helpers of all operators."""
 
 from collections.abc import Generator
 
@@ -14,32 +14,32 @@ from .scene import Caution, Rigged, SceneError
 from .steps import Stepped
 
 LEVELS = ((0.0, 0.0), (0.03, 1.0), (0.1, 2.0))
-"""By what shares of a correction a pose goes on beyond it, and by how many of the depths that are
-left parts are kept apart, each where the one before brings Blender's meshes no nearer to free."""
+"""Pairs of the overshoot, as a share of the correction, and the extra clearance, in remaining
+depths; the next pair is tried when one no longer improves Blender's meshes."""
 
 LEAST_CHANGE = 5e-4
-"""Of the body's size: bones whose turns move no vertex by more, together, stay as they were."""
+"""Bones whose turns together move no vertex by more than this, in body sizes, are not turned."""
 
 MOST_STEPS, _MOST_NAMED = 10, 3
 
 _ROUNDING = 1e-6
-"""Of the body's size: a depth that differs by less is the same."""
+"""Difference of depths, in body sizes, that counts as rounding."""
 
 
 def array(values: dict) -> np.ndarray:
-    """Return an array of the engine's answer."""
+    """Return an array from the engine's answer."""
     return np.frombuffer(values["data"], values["dtype"]).reshape(values["shape"])
 
 
 def is_worse(after: dict, before: dict) -> bool:
-    """Return whether a check finds more pairs than another, or deeper ones."""
+    """Return whether a check finds more or deeper pairs than another."""
     return after["pairs"] > before["pairs"] or after["deepest"] > before["deepest"] + _ROUNDING
 
 
 def open_character(
     rigged: Rigged, settings: bpy.types.PropertyGroup, poses: np.ndarray | None = None
 ) -> Generator[str, None, Opened]:
-    """Open a character as it is now, and list its groups in the panel."""
+    """Open the present character, and list its groups in the panel."""
     found.clear()
     character = yield from opening(rigged, settings.chosen_rules(rigged), poses)
     settings.of, settings.left_out = rigged.armature.name, rigged.left_out_lines()
@@ -51,7 +51,7 @@ def open_character(
 
 
 def _group_names(by_kind: dict[str, list[str]]) -> list[str]:
-    """List the groups of all kinds, without those that another kind has but for capitals."""
+    """List the groups of all kinds, without names that differ from another kind's only by case."""
     names: dict[str, None] = {}
     for kind in by_kind.values():
         known = {name.casefold() for name in names}
@@ -60,11 +60,14 @@ def _group_names(by_kind: dict[str, list[str]]) -> list[str]:
 
 
 def turning(rigged: Rigged, settings: bpy.types.PropertyGroup) -> list[str] | None:
-    """Return the bones that alone may turn, None for all: selected ones, those with controls.
+    """Return the bones that may turn, None for all.
+
+    Bones in a mirror's plane, bones without a control, if controls are used, and bones that are
+    not selected, if the panel says so, may not.
 
     Raises
     ------
-    SceneError : none of them deforms.
+    SceneError : no deforming bone is selected.
     """
     bones, controls, mirrored = rigged.armature.pose.bones, rigged.controls, rigged.in_mirrors()
     chosen = [name for name in rigged.bones if name not in mirrored]
@@ -85,7 +88,7 @@ def turning(rigged: Rigged, settings: bpy.types.PropertyGroup) -> list[str] | No
 
 
 def _is_selected(bone: bpy.types.PoseBone) -> bool:
-    # Of the pose since Blender 5.0.
+    # An attribute of the pose bone since Blender 5.0.
     return bone.select if hasattr(bone, "select") else bone.bone.select
 
 
@@ -99,11 +102,11 @@ class LCOLLISION_OT_check_pose(Stepped, bpy.types.Operator):
 
     bl_idname = "lcollision.check_pose"
     bl_label = "Check Pose"
-    # It changes nothing of the user's that an undo could bring back.
+    # No UNDO: it changes nothing of the user's data.
     bl_options = {"REGISTER"}
 
     def steps(self, context, settings) -> Steps:
-        """Check, and show what was found."""
+        """Check, and show the result."""
         rigged = Rigged.of(context)
         character = yield from open_character(rigged, settings)
         shown = Shown.of(rigged)
@@ -120,7 +123,7 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
     bl_label = "Resolve Pose"
 
     def steps(self, context, settings) -> Steps:
-        """Resolve, write the bones, and check what Blender makes of it."""
+        """Resolve, write the bones, and check the pose as Blender shows it."""
         rigged = Rigged.of(context)
         rigged.ensure_writable()
         is_keyed = context.scene.tool_settings.use_keyframe_insert_auto
@@ -178,14 +181,14 @@ class _Resolving:
 
     Parameters
     ----------
-    rigged : of which bones or controls are turned; one that is copied is baked before that
-    first, shown : the check of the pose as it is, and that
+    rigged : the character whose bones or controls are turned; baked first if it needs a copy
+    first, shown : the check of the original pose, and that pose
 
     Attributes
     ----------
-    rigged : what is turned
-    basis, kept : its properties as they were, and the best that were found
-    best : the check of these
+    rigged : the character that is turned
+    basis, kept : its original properties, and the best ones found
+    best : the check of `kept`
     reply : the engine's last
     by_fk : limbs that were switched to FK for it
     """
@@ -198,7 +201,7 @@ class _Resolving:
         self._first, self._shown = first, shown
 
     def take_back(self) -> None:
-        """Leave everything as it was before."""
+        """Restore everything as it was before."""
         if self.rigged is not self._original:
             self.rigged.remove_copy()
         elif self.basis is not None:
@@ -207,7 +210,7 @@ class _Resolving:
     def steps(
         self, context: bpy.types.Context, settings: bpy.types.PropertyGroup, is_keyed: bool
     ) -> Generator[str, None, bool]:
-        """Go on from what Blender shows until it is free or no nearer; tell if it is better."""
+        """Repeat from what Blender shows until free or no better; return if it has improved."""
         character, first = self._character, self._first
         clearance = character.clearance(self.rigged)
         locked = set(self.rigged.locked())
@@ -221,7 +224,7 @@ class _Resolving:
             "turning": turning(self.rigged, settings),
             "least_change": LEAST_CHANGE,
         }
-        # Where the next step begins.
+        # The starting point of the next step.
         start, begun, level = asked, None, 0
         for _ in range(MOST_STEPS):
             progress: list[int] = []
@@ -261,22 +264,22 @@ class _Resolving:
             self.by_fk = by_fk if start is asked else self.by_fk | by_fk
             if not after["colliding"]:
                 break
-            # Modifiers and scales move otherwise than the engine says: go on from there.
+            # Modifiers and scales move the mesh differently from the engine: continue from there.
             now = {"transforms": shown.transforms, "vertices": shown.vertices}
             start, begun = asked | now, self.kept
         if self._original.controls is not None and self.best["colliding"] and reply["free"]:
-            # Where controls do not bring what the engine has found, a copy may.
+            # If the controls cannot reproduce the engine's result, a baked copy may.
             return False
         return self.best is not first
 
 
 def _cost(check: dict) -> tuple:
-    """Return what is less of the better of two checks."""
+    """Return the cost of a check, as a tuple to compare."""
     return check["pairs"], check["deepest"]
 
 
 def where(rigged: Rigged, by_fk: set[str]) -> str:
-    """Say what was written of a rig that constraints or drivers move."""
+    """Return where the result for a rig with constraints or drivers was written."""
     if rigged.controls is None:
         return f"written to a baked copy, {rigged.armature.name}"
     limbs = ", ".join(name.replace("_parent", "") for name in sorted(by_fk))
@@ -284,7 +287,7 @@ def where(rigged: Rigged, by_fk: set[str]) -> str:
 
 
 def _rest(rigged: Rigged, reply: dict) -> str:
-    """Say why a pose still collides: what moves the meshes besides the turns of bones."""
+    """Return why a pose still collides: influences on the meshes besides the bones' turns."""
     others = rigged.moved_besides()
     if not others:
         return reply["note"]
@@ -302,6 +305,6 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take them away."""
+    """Remove the operators."""
     for one in reversed(_CLASSES):
         bpy.utils.unregister_class(one)

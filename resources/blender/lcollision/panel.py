@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The panel in the 3D view's sidebar, and what scenes keep of its settings."""
+"""The panel in the 3D view's sidebar, and its settings, stored in scenes."""
 
 import json
 
@@ -22,7 +22,7 @@ from .scene import HIDDEN, OFF_RIG, Rigged, SceneError
 _NOT_CHECKED = "Not checked yet"
 
 _WIDTH, _MARGINS, _ICON = 220.0, 56.0, 20.0
-"""Pixels of a sidebar as Blender first shows it, of what is beside text in it, and of an icon."""
+"""Widths in pixels: Blender's initial sidebar, the margins around text in it, and an icon."""
 
 
 class LCOLLISION_PG_group(bpy.types.PropertyGroup):
@@ -130,12 +130,12 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
     frame: IntProperty(name="Colliding Frame", update=lambda self, context: self.jump(context))
 
     def jump(self, context: bpy.types.Context) -> None:
-        """Go to the frame that is chosen in the list."""
+        """Go to the frame chosen in the list."""
         if 0 <= self.frame < len(self.frames):
             context.scene.frame_set(self.frames[self.frame].frame)
 
     def switch(self, is_on: bool) -> None:
-        """Turn the live check on or off, whatever scene is shown next."""
+        """Turn the live check on or off, for all scenes."""
         for scene in bpy.data.scenes:
             scene.lcollision.looks = is_on
         live.switch(is_on)
@@ -148,27 +148,27 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
         if self.tolerated:
             rules["tolerated_depth"] = self.tolerated / 100.0
         places = json.loads(self.places or "{}")
-        # They are faces by number.
+        # Places are face numbers, valid only for this mesh.
         if places.pop("of", "") == repr(rigged.key()):
             rules |= places
         return rules
 
     def kept(self) -> str:
-        """Say what holds of a pose that is free."""
+        """Return the verdict on a free pose."""
         return "The clearance is kept" if self.clearance else "No collisions"
 
     def checked(self) -> str:
-        """Say how much of the character was checked."""
+        """Return how much of the character was checked."""
         n = len(self.left_out.split("\n")) if self.left_out else 0
         return f"checked without {n} mesh{'es' if n > 1 else ''}" if n else "checked"
 
     def forget(self) -> None:
-        """Take the verdict back."""
+        """Withdraw the verdict."""
         self.verdict, self.details, self.off_rig = _NOT_CHECKED, "", 0.0
         self.is_of_pose, self.left_out = False, ""
 
     def show(self, reply: dict, armature: str) -> None:
-        """Keep what a check of a pose has found."""
+        """Show the result of a check of a pose."""
         self.is_of_pose, self.of = True, armature
         self.off_rig = reply["off_rig"]
         if not reply["colliding"]:
@@ -194,7 +194,7 @@ class LCOLLISION_UL_frames(bpy.types.UIList):
     def draw_item(
         self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0
     ) -> None:
-        """Draw one of them."""
+        """Draw one frame of the list."""
         row = layout.row()
         row.label(text=f"{item.frame}")
         row.label(text=f"{100.0 * item.deepest:.2f} %")
@@ -252,7 +252,7 @@ class LCOLLISION_PT_panel(bpy.types.Panel):
 
 
 class _ClosedPart:
-    """Where the parts of the panel that begin closed are."""
+    """Placement of the panel's sub-panels that are closed at first."""
 
     bl_parent_id = "LCOLLISION_PT_panel"
     bl_space_type = "VIEW_3D"
@@ -305,7 +305,7 @@ class LCOLLISION_PT_rules(_ClosedPart, bpy.types.Panel):
 
 
 def _draw_meshes(layout: bpy.types.UILayout, rigged: Rigged) -> None:
-    """List the meshes that are checked, and those that are not, each with a tick."""
+    """List the visible meshes, each with a tick, and the hidden ones."""
     hidden = {item for item, why in rigged.left_out if why == HIDDEN}
     ticked = [*rigged.meshes, *(item for item, _ in rigged.left_out if item not in hidden)]
     column = layout.column(align=True)
@@ -348,7 +348,7 @@ def _draw_verdict(
 
 
 def _say(layout: bpy.types.UILayout, text: str, icon: str = "NONE") -> None:
-    """Draw a sentence in as many lines as the sidebar's width asks for."""
+    """Draw a sentence, wrapped to the sidebar's width."""
     style, region = bpy.context.preferences.ui_styles[0].widget, bpy.context.region
     scale = bpy.context.preferences.system.ui_scale
     blf.size(0, style.points * scale)
@@ -368,7 +368,7 @@ def _say(layout: bpy.types.UILayout, text: str, icon: str = "NONE") -> None:
 
 
 def where_written(rigged: Rigged) -> str:
-    """Say where Resolve writes."""
+    """Return a sentence on where Resolve writes."""
     if rigged.is_driven and rigged.may_have_controls:
         return "Writes to the controls where these can free it, else to a baked copy"
     if rigged.is_driven:
@@ -402,7 +402,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take them away."""
+    """Remove the panel and the settings."""
     del bpy.types.Object.lcollision_is_checked
     del bpy.types.Scene.lcollision
     for one in reversed(_CLASSES):

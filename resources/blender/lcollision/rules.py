@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What does not count: pairs of groups, and places that touch in nearly every pose."""
+"""Contact rules: ignored pairs of groups, and places that touch in nearly every pose."""
 
 import json
 
@@ -15,7 +15,7 @@ from .scene import Rigged
 from .steps import Stepped
 
 _FEWEST_POSES, _MOST_POSES = 8, 40
-"""Of a motion's frames, evenly spaced, that say enough about which places always touch."""
+"""Limits of the number of evenly spaced frames in which touching places are looked for."""
 
 
 class LCOLLISION_OT_ignore_pair(bpy.types.Operator):
@@ -59,7 +59,7 @@ class LCOLLISION_OT_propose(Stepped, bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     def steps(self, context, settings) -> Steps:
-        """Read poses of the motion, if there is one, and ask."""
+        """Read poses of the motion, if there is one, and request proposals."""
         rigged, scene = Rigged.of(context), context.scene
         character = yield from open_character(rigged, settings)
         poses, before = [], scene.frame_current
@@ -104,7 +104,7 @@ class LCOLLISION_OT_ignore_places(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set:
-        """Add them to those that do not count already."""
+        """Add them to the places that already do not count."""
         settings = context.scene.lcollision
         if not settings.proposal:
             self.report({"ERROR"}, "Propose Places first")
@@ -127,7 +127,7 @@ class LCOLLISION_OT_count_places(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set:
-        """Forget them."""
+        """Clear the places."""
         context.scene.lcollision.places = ""
         found.clear()
         return {"FINISHED"}
@@ -149,6 +149,6 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take them away."""
+    """Remove the operators."""
     for one in reversed(_CLASSES):
         bpy.utils.unregister_class(one)

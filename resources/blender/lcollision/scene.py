@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What Blender shows of a character, in its armature's own frame, and what is written to its bones.
+"""Reading a character as Blender shows it, in its armature's coordinates, and writing its bones.
 
-The evaluated meshes are what is checked: with constraints, drivers, shape keys and modifiers.
-Vertices and transforms are float64, in the unit of the armature object.
+The evaluated meshes are checked: with constraints, drivers, shape keys and modifiers. Vertices and
+transforms are float64, in the unit of the armature object.
 """
 
 from collections.abc import Iterator
@@ -17,50 +17,50 @@ from .controls import Controls, State, candidates, put_state, rotation_path, set
 from .tree import Tree, carrier_of, is_deformed_by, is_moved, read_tree
 
 _MEMBER = 0.5
-"""The weight over which a vertex is of a vertex group whose pairs are ignored."""
+"""Weight above which a vertex belongs to a vertex group."""
 
 OFF_RIG = 1e-4
-"""Of the body's size: beyond it, a mesh is shown elsewhere than its bones alone say."""
+"""Offset, in body sizes, above which a mesh counts as moved by more than its bones."""
 
 HIDDEN, UNTICKED = "hidden", "not ticked"
 """Why a mesh of a character is not checked."""
 _FLAT = 1e-9
-"""Of the volume that an armature's axes would span at right angles: it is shown without depth."""
+"""An armature whose axes span less than this share of an orthogonal volume has no depth."""
 
 _STILL = 1e-7
-"""Of the longest bone: what a bone moves by no more, it only turns."""
+"""Translation, in lengths of the longest bone, below which a bone only turns."""
 
 _IN_PLANE = 1e-2
-"""Of the longest bone: a bone whose ends are no farther from a mirror's plane lies in it."""
+"""Twice the distance from a mirror's plane, in longest bones, below which a bone lies in it."""
 
 _TURNED = 1e-5
-"""Of a rotation matrix, and of the longest bone: a bone that is off by less stays as it was."""
+"""Change of a matrix entry, or in longest bones, below which a bone stays as it was."""
 
 
 class SceneError(Exception):
-    """A sentence on what the scene lacks."""
+    """A sentence on what is wrong with the scene."""
 
 
 class Caution(str):
-    """A report of what was done that is shown as a warning."""
+    """A report on the work done, shown as a warning."""
 
 
 class Rigged:
-    """An armature and the meshes that its bones move: deformed, or carried as a helmet is.
+    """An armature and the meshes that its bones move: deformed, or carried like a helmet.
 
     Parameters
     ----------
     armature : the object
-    meshes : the objects, by name
+    meshes : the objects, sorted by name
     left_out : further meshes of the character, and why each is not checked
-    tree : of the bones that move the meshes, read if it is not given
+    tree : of the bones that move the meshes; read if not given
 
     Attributes
     ----------
     armature, meshes, left_out : as given
     bones : J names of the bones that move meshes, parents first
-    parents : (J,) int32 array: what each hangs on, -1 for nothing
-    controls : by which these are turned; None where they are turned themselves
+    parents : (J,) int32 array, -1 for none
+    controls : that turn the bones; None if the bones are turned directly
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Rigged:
 
         Raises
         ------
-        SceneError : there is none.
+        SceneError : there is no such armature or mesh, or the pose is not shown.
         """
         active = context.view_layer.objects.active
         armatures = [one for one in context.view_layer.objects if one.type == "ARMATURE"]
@@ -118,7 +118,7 @@ class Rigged:
         return found
 
     def _ensure_pose_is_shown(self) -> None:
-        """Refuse what is not shown in its pose: a verdict on it would not be one on the pose."""
+        """Refuse a character that is not shown in its pose: the verdict would not apply to it."""
         name = self.armature.name
         for item in (self.armature, *self.meshes):
             if item.data.is_editmode:
@@ -146,7 +146,7 @@ class Rigged:
             raise SceneError(f"{name} is scaled to 0; give it a scale in all directions")
 
     def by_controls(self) -> "Rigged | None":
-        """Return the same, posed by the controls of its rig; None if these are not known."""
+        """Return the same character, posed by its rig's controls; None if none are found."""
         controls = Controls.of(self.armature, self._tree)
         if controls is None:
             return None
@@ -156,24 +156,24 @@ class Rigged:
 
     @property
     def may_have_controls(self) -> bool:
-        """Whether there is a bone that may be a control: what it turns is looked at by Resolve."""
+        """Whether some bone may be a control; Resolve finds out what it turns."""
         return bool(candidates(self.armature))
 
     @property
     def is_copied(self) -> bool:
-        """Whether what is resolved is written to a baked copy."""
+        """Whether the resolved pose is written to a baked copy."""
         return self.controls is None and self.is_driven
 
     def writers(self, joint: int) -> list[str]:
-        """Return the names of the bones by which a joint is turned."""
+        """Return the names of the bones that turn a joint."""
         return [self.bones[joint]] if self.controls is None else self.controls.of_joint(joint)
 
     def jumping(self, by_fk: set[str]) -> set[tuple[str, str]]:
-        """Return the properties that mean nothing where limbs are not switched to FK."""
+        """Return the properties that have no effect unless limbs are switched to FK."""
         return set() if self.controls is None else self.controls.jumping(by_fk)
 
     def ensure_writable(self) -> None:
-        """Refuse to resolve what no file would keep, before anything is computed.
+        """Refuse to resolve an armature whose changes no file would keep, before computing.
 
         Raises
         ------
@@ -189,7 +189,7 @@ class Rigged:
 
     @property
     def is_driven(self) -> bool:
-        """Whether something else than their keys may move bones: constraints, IK or drivers."""
+        """Whether anything but keys may move bones: constraints, IK or drivers."""
         constrained = any(
             not one.mute and one.influence > 0.0
             for bone in self.armature.pose.bones
@@ -199,7 +199,7 @@ class Rigged:
         return constrained or (data is not None and len(data.drivers) > 0)
 
     def moved_besides(self) -> list[str]:
-        """Name what moves the meshes besides the turns of bones."""
+        """List the influences that move the meshes besides the turns of bones."""
         found = []
         for mesh in self.meshes:
             modifiers = [one for one in mesh.modifiers if one.show_viewport]
@@ -220,11 +220,11 @@ class Rigged:
         return found
 
     def left_out_lines(self) -> str:
-        """Say which meshes are not checked, and why, a line each."""
+        """Return a line for each mesh that is not checked, with the reason."""
         return "\n".join(f"{item.name} ({why})" for item, why in self.left_out)
 
     def key(self) -> tuple:
-        """Return what tells without much work whether it is the same character still."""
+        """Return a key that is cheap to compute and changes with the character."""
         graph = bpy.context.evaluated_depsgraph_get()
         shown = (one.evaluated_get(graph).data for one in self.meshes)
         counts = tuple(
@@ -234,7 +234,7 @@ class Rigged:
         return self.armature.name, tuple(self.bones), self.parents.tobytes(), counts
 
     def shown(self) -> np.ndarray:
-        """Return the (W, 3) vertices of all meshes as they are shown."""
+        """Return the (W, 3) vertices of all meshes as shown."""
         graph = bpy.context.evaluated_depsgraph_get()
         points = []
         for one, into in self._evaluated(graph):
@@ -246,30 +246,30 @@ class Rigged:
         return np.concatenate(points)
 
     def transforms(self) -> np.ndarray:
-        """Return the (J, 4, 4) transforms of the bones as they are shown."""
+        """Return the (J, 4, 4) transforms of the bones as shown."""
         graph = bpy.context.evaluated_depsgraph_get()
         bones = self.armature.evaluated_get(graph).pose.bones
         read = np.array([bones[name].matrix for name in self.bones], dtype=np.float64)
         return self._mirrored(read)
 
     def _evaluated(self, graph: bpy.types.Depsgraph) -> Iterator[tuple]:
-        """Yield the evaluated meshes, and what brings each into the armature's frame."""
+        """Yield each evaluated mesh with its (4, 4) matrix to the armature's coordinates."""
         armature = np.array(self.armature.evaluated_get(graph).matrix_world, dtype=np.float64)
         for item in self.meshes:
             one = item.evaluated_get(graph)
             yield one, np.linalg.inv(armature) @ np.array(one.matrix_world, dtype=np.float64)
 
     def to_world(self) -> np.ndarray:
-        """Return the (4, 4) matrix from the armature's frame to the world's."""
+        """Return the (4, 4) matrix from armature to world coordinates."""
         graph = bpy.context.evaluated_depsgraph_get()
         return np.array(self.armature.evaluated_get(graph).matrix_world, dtype=np.float64)
 
     def world_size(self) -> float:
-        """Return how long a unit of the armature's frame is in the world."""
+        """Return the length of an armature unit in world coordinates."""
         return float(np.cbrt(abs(np.linalg.det(self.to_world()[:3, :3]))))
 
     def as_character(self) -> dict:
-        """Return the meshes in the rest pose, with weights and bones, as `open_mesh` takes them."""
+        """Return the fields of an `open_mesh` request: rest meshes, weights and bones."""
         bones = self.armature.data.bones
         rest = np.array([bones[name].matrix_local for name in self.bones], dtype=np.float64)
         with self._at_rest():
@@ -299,7 +299,7 @@ class Rigged:
             data.pose_position = before
 
     def _part(self, one: bpy.types.Object, into: np.ndarray) -> dict:
-        """Return one evaluated mesh."""
+        """Return one evaluated mesh as a part of an `open_mesh` request."""
         joint = {name: number for number, name in enumerate(self.bones)}
         carrier = self._carriers[one.original]
         of_group = [
@@ -322,7 +322,7 @@ class Rigged:
                     weights.append(group.weight)
         if carrier is not None:
             rows, joints, weights = range(n), [joint[carrier]] * n, [1.0] * n
-        # A column for each influence of the vertex that has the most.
+        # As many columns as the largest number of influences of a vertex.
         counts = np.bincount(np.array(rows, dtype=np.int64), minlength=n)
         column = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
         joint_of = np.zeros((n, max(1, counts.max(initial=0))), np.int32)
@@ -352,7 +352,7 @@ class Rigged:
         }
 
     def triangles(self) -> np.ndarray:
-        """Return the (F, 3) vertices of all triangles as they are shown, as faces are numbered."""
+        """Return the (F, 3) vertex indices of all shown triangles, in the engine's face order."""
         graph = bpy.context.evaluated_depsgraph_get()
         found, first = [], 0
         for one, _ in self._evaluated(graph):
@@ -366,11 +366,11 @@ class Rigged:
         return np.concatenate(found)
 
     def locked(self) -> list[str]:
-        """Return the bones all of whose rotations are locked.
+        """Return the bones whose rotations are all locked.
 
-        Where a copy is written, locks of bones that constraints and drivers move do not count:
-        rigs lock these so that nobody turns them by hand. Those of controls count for what they
-        turn.
+        If a copy is written, locks of bones that constraints and drivers move do not count: rigs
+        lock these so that nobody turns them by hand. A control's locks count for the bone that it
+        turns.
         """
         if self.controls is not None:
             return [self.bones[joint] for joint in sorted(self.controls.locked)]
@@ -398,7 +398,7 @@ class Rigged:
     def in_mirrors(self) -> set[str]:
         """Return the bones that lie in the plane of a Mirror modifier after the armature.
 
-        It shows one side as the other: what turns out of the plane would tear at it.
+        It shows one side as the mirror image of the other, so a bone in the plane must not turn.
         """
         reflection = self._reflection()
         if reflection is None:
@@ -412,7 +412,7 @@ class Rigged:
         return found
 
     def _mirrored(self, transforms: np.ndarray) -> np.ndarray:
-        """Let bones of a side that a Mirror modifier shows stand as those of the other side do."""
+        """Give the bones of a side that a Mirror modifier generates the other side's transforms."""
         reflection = self._reflection()
         if reflection is None:
             return transforms
@@ -430,7 +430,7 @@ class Rigged:
         return after
 
     def _driven(self) -> set[str]:
-        """Return the bones that constraints or drivers move, themselves or between joints."""
+        """Return the bones that constraints or drivers move, directly or by a skipped ancestor."""
         data = self.armature.animation_data
         paths = [] if data is None else [one.data_path for one in data.drivers]
         moved = {
@@ -450,7 +450,7 @@ class Rigged:
         return found
 
     def state(self) -> State:
-        """Return the properties that are written as they are now."""
+        """Return the present values of the properties that are written."""
         if self.controls is not None:
             return self.controls.state()
         bones = self.armature.pose.bones
@@ -460,7 +460,7 @@ class Rigged:
         return state_of(self.armature, paths)
 
     def put(self, state: State) -> None:
-        """Let the properties that are written be what they were."""
+        """Restore the properties that are written."""
         put_state(self.armature, state)
         self.armature.update_tag()
 
@@ -471,13 +471,13 @@ class Rigged:
         turns: np.ndarray,
         by_fk: set[str] = frozenset(),
     ) -> set[str]:
-        """Turn bones from where they are.
+        """Turn bones from their present pose.
 
         Parameters
         ----------
-        transforms : (J, 4, 4) as they are
-        joints, turns : n numbers and (n, 4, 4), as the engine answers
-        by_fk : limbs that are to be posed by FK, as `Controls.place` takes them
+        transforms : (J, 4, 4) of the present pose
+        joints, turns : n indices and (n, 4, 4), from the engine's answer
+        by_fk : limbs to be posed by FK, see `Controls.place`
 
         Returns
         -------
@@ -487,7 +487,7 @@ class Rigged:
             return self.controls.place(self.posed(transforms, joints, turns), by_fk)
         for joint, turn in zip(*self.in_bones(transforms, joints, turns), strict=True):
             if not self._tree.moves[joint]:
-                # Of what a Mirror modifier shows, the other side's bones have the vertices.
+                # With a Mirror modifier, the vertices belong to the other side's bones.
                 continue
             bone = self.armature.pose.bones[self.bones[joint]]
             after = bone.matrix_basis @ Matrix(turn.tolist())
@@ -498,12 +498,12 @@ class Rigged:
         return set()
 
     def posed(self, transforms: np.ndarray, joints: list[int], turns: np.ndarray) -> np.ndarray:
-        """Return the (J, 4, 4) transforms of bones that are turned, with what hangs on them.
+        """Return the (J, 4, 4) transforms after turning some bones, with everything below them.
 
         Parameters
         ----------
-        transforms : (J, 4, 4) as they are
-        joints, turns : n numbers and (n, 4, 4), as the engine answers
+        transforms : (J, 4, 4) before
+        joints, turns : n indices and (n, 4, 4), from the engine's answer
         """
         turn_of, after = dict(zip(joints, turns, strict=True)), np.empty_like(transforms)
         for at, above in enumerate(self.parents.tolist()):
@@ -511,7 +511,7 @@ class Rigged:
             own = np.linalg.inv(before) @ transforms[at]
             turn = turn_of.get(at)
             if turn is not None:
-                # What scales a bone is done before it turns.
+                # A bone is scaled before it turns.
                 size = np.append(np.linalg.norm(own[:3, :3], axis=0), 1.0)
                 own = own @ (turn / size[:, None] * size)
             after[at] = now @ own
@@ -520,15 +520,15 @@ class Rigged:
     def in_bones(
         self, transforms: np.ndarray, joints: list[int], turns: np.ndarray
     ) -> tuple[list[int], np.ndarray]:
-        """Return which bones turn, and how, against what Blender hangs them on.
+        """Return which bones turn, and how, relative to their parents in Blender.
 
-        Bones that hang on another here, or do not go with its rotation or scale, turn also where
-        only that does.
+        A bone whose parent differs here, or that does not inherit its rotation or scale, also
+        turns when only the parent does.
 
         Parameters
         ----------
-        transforms : (J, 4, 4) as they are
-        joints, turns : n numbers and (n, 4, 4), as the engine answers
+        transforms : (J, 4, 4) before
+        joints, turns : n indices and (n, 4, 4), from the engine's answer
         """
         after, turn_of = (
             self.posed(transforms, joints, turns),
@@ -573,7 +573,7 @@ class Rigged:
         return np.array([self.armature.data.bones[name].length for name in self.bones])
 
     def baked_copy(self) -> "Rigged":
-        """Copy the armature and all that goes with it, without constraints and drivers, as shown.
+        """Copy the armature, as shown, and everything that follows it, without constraints.
 
         The copy is linked to the same collections; the original is hidden, in renders too.
         """
@@ -583,7 +583,7 @@ class Rigged:
             copies[item] = copy = item.copy()
             copy.name = f"{item.name}.free"
             if copy.override_library is not None:
-                # Else the next opening of the file brings its constraints back.
+                # Otherwise, reopening the file would restore its constraints.
                 copy.make_local(clear_liboverride=True)
             own = [one for one in item.users_collection if _takes_objects(one)]
             for collection in own or [bpy.context.scene.collection]:
@@ -617,7 +617,7 @@ class Rigged:
         return found
 
     def _following(self) -> list[bpy.types.Object]:
-        """Return the objects that bones deform or carry, and what is parented to these."""
+        """Return the objects that bones deform or carry, and their children."""
         found = []
         for item in bpy.context.view_layer.objects:
             follows = item.type == "MESH" and is_deformed_by(item, self.armature)
@@ -627,7 +627,7 @@ class Rigged:
         return [item for item in dict.fromkeys(found) if item in there and item != self.armature]
 
     def remove_copy(self) -> None:
-        """Take this baked copy away again, and show what it was made of."""
+        """Remove this baked copy, and show the original again."""
         for item in (*self.meshes, *self._further):
             bpy.data.objects.remove(item)
         for item, was_hidden, was_hidden_in_renders in self._hidden:
@@ -636,13 +636,13 @@ class Rigged:
         bpy.context.view_layer.objects.active = self._was_active
 
     def matrices(self) -> dict[str, Matrix]:
-        """Return the transforms of all bones as they are shown."""
+        """Return the transforms of all bones as shown."""
         graph = bpy.context.evaluated_depsgraph_get()
         bones = self.armature.evaluated_get(graph).pose.bones
         return {bone.name: bone.matrix.copy() for bone in bones}
 
     def place(self, matrices: dict[str, Matrix]) -> None:
-        """Give all bones transforms, where no constraint is in the way."""
+        """Set the transforms of all bones of an armature without constraints."""
         for bone in self.armature.pose.bones:
             above = {}
             if bone.parent is not None:
@@ -658,12 +658,12 @@ class Rigged:
 
 
 def _is_even(scale: Vector) -> bool:
-    """Return whether something is scaled alike in all directions."""
+    """Return whether a scale is uniform."""
     return max(scale) - min(scale) <= _TURNED * max(map(abs, scale))
 
 
 def _retarget(held: bpy.types.bpy_struct, copies: dict[bpy.types.Object, bpy.types.Object]) -> None:
-    """Let a modifier or a constraint be about copies of the objects that it is about."""
+    """Redirect a modifier or a constraint from objects to their copies."""
     for path, kind in held.bl_rna.properties.items():
         if kind.type == "POINTER" and not kind.is_readonly and getattr(held, path) in copies:
             setattr(held, path, copies[getattr(held, path)])
@@ -673,5 +673,5 @@ def _retarget(held: bpy.types.bpy_struct, copies: dict[bpy.types.Object, bpy.typ
 
 
 def _takes_objects(collection: bpy.types.Collection) -> bool:
-    """Return whether objects can be linked to a collection: to those of other files they cannot."""
+    """Return whether objects can be linked to a collection; not if it is from another file."""
     return collection.library is None and collection.override_library is None

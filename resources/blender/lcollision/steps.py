@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Work that takes a while: in the interface a little at each tick, with progress and Esc."""
+"""Long work: in the interface a little at each tick, with progress and Esc."""
 
 import time
 
@@ -10,7 +10,7 @@ from .client import EngineCancelled, EngineError
 from .scene import Caution, SceneError
 
 _TICK, _SHARE = 0.05, 0.6
-"""Seconds between two ticks, and how much of that is worked."""
+"""Seconds between two ticks, and the share of that spent working."""
 
 
 class Stepped:
@@ -19,7 +19,7 @@ class Stepped:
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set:
-        """Do all of it."""
+        """Run all steps."""
         self._steps = self.steps(context, context.scene.lcollision)
         while True:
             done = self._step()
@@ -29,7 +29,7 @@ class Stepped:
                 time.sleep(0.002)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set:
-        """Begin."""
+        """Start the steps as a modal operator."""
         self._steps = self.steps(context, context.scene.lcollision)
         manager = context.window_manager
         self._timer = manager.event_timer_add(_TICK, window=context.window)
@@ -38,7 +38,7 @@ class Stepped:
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set:
-        """Go on for a moment."""
+        """Run steps for a part of a tick."""
         if event.type == "ESC":
             self.cancel(context)
             return {"CANCELLED"}
@@ -60,7 +60,7 @@ class Stepped:
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """End without a result, by Esc or as Blender says."""
+        """End without a result, by Esc or by Blender."""
         try:
             self._steps.close()
         finally:
@@ -72,7 +72,7 @@ class Stepped:
         link.n_going_on -= 1
 
     def _step(self) -> set | None:
-        """Do one step; return the operator's result at the end."""
+        """Run one step; return the operator's result at the end."""
         try:
             self._text = next(self._steps)
         except StopIteration as end:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which meshes the bones of an armature move, and on what each of these bones hangs.
+"""The bones of an armature that move meshes, and their hierarchy.
 
-Rigs hang bones that deform on bones that do not, which other bones and constraints move: what
-matters of these is which bone that deforms goes with them.
+In rigs, deforming bones often have parents that do not deform but follow other bones or
+constraints. The hierarchy skips those and keeps the deforming bone that moves with them.
 """
 
 from collections.abc import Iterable
@@ -12,23 +12,23 @@ import bpy
 import numpy as np
 
 _SAME = 1e-4
-"""Of the longest bone: bones whose ends are no farther apart at rest are at the same place."""
+"""Bones whose ends at rest are within this share of the longest bone coincide."""
 
 _HOLDING = {"CHILD_OF", "COPY_TRANSFORMS", "ARMATURE"}
-"""Constraints by which something goes with a bone as if it were parented to it."""
+"""Constraints by which an object or bone follows a bone like a child."""
 
 
 @dataclass(frozen=True)
 class Tree:
-    """Bones that move meshes.
+    """The hierarchy of bones that move meshes.
 
     Attributes
     ----------
     bones : J names, parents first
-    parents : (J,) int32 array: what each hangs on, -1 for nothing
-    own_parents : (J,) int32 array: the next one up that Blender hangs each on, -1 for none
-    is_next : whether that is its parent in Blender, with no other bone in between
-    moves : (J,) whether it, or what hangs on it, has vertices
+    parents : (J,) int32 array, -1 for none
+    own_parents : (J,) int32 array: the nearest ancestor in Blender among the bones, -1 for none
+    is_next : whether that is the direct parent in Blender
+    moves : (J,) whether the bone, or one below it, has vertices
     """
 
     bones: list[str]
@@ -46,7 +46,7 @@ def is_deformed_by(mesh: bpy.types.Object, armature: bpy.types.Object) -> bool:
 
 
 def carrier_of(item: bpy.types.Object, armature: bpy.types.Object) -> str | None:
-    """Return the bone that an object is parented to or held by, itself or what it hangs on."""
+    """Return the bone that an object, or an ancestor of it, is parented to or held by."""
     while item is not None:
         for one in item.constraints:
             bone = _held_by(one, armature)
@@ -65,7 +65,7 @@ def is_moved(mesh: bpy.types.Object, armature: bpy.types.Object) -> bool:
 
 
 def _held_by(constraint: bpy.types.Constraint, armature: bpy.types.Object) -> str | None:
-    """Return the bone of an armature that a constraint lets something go with."""
+    """Return the bone of an armature that a constraint makes its owner follow."""
     if constraint.type not in _HOLDING:
         return None
     targets = constraint.targets if constraint.type == "ARMATURE" else [constraint]
@@ -76,11 +76,11 @@ def _held_by(constraint: bpy.types.Constraint, armature: bpy.types.Object) -> st
 def read_tree(
     armature: bpy.types.Object, meshes: Iterable[bpy.types.Object], carriers: set[str]
 ) -> Tree:
-    """Find on what the bones hang that deform meshes or carry them.
+    """Find the hierarchy of the bones that deform or carry meshes.
 
-    A bone hangs on the next one up that is among them, or that is at the same place at rest as
-    one that is not: what both are made of. One above which is none of those hangs on the
-    nearest to its head, so that limbs follow the trunk.
+    A bone's parent is its nearest ancestor among these bones, or the one of them that coincides
+    at rest with an ancestor that is not. A root that moves something hangs on the bone nearest to
+    its head, so that limbs follow the trunk.
 
     Parameters
     ----------
@@ -158,18 +158,18 @@ def read_tree(
 
 
 def _weighted(chosen: list[bpy.types.Bone], meshes: Iterable[bpy.types.Object]) -> set[int]:
-    """Return the numbers of bones that vertices are weighted to."""
+    """Return the indices of bones that vertices are weighted to."""
     names = {bone.name: at for at, bone in enumerate(chosen)}
     groups = {name for mesh in meshes for name in _weighted_groups(mesh)}
     return {names[name] for name in groups if name in names}
 
 
 _groups: dict[tuple, frozenset[str]] = {}
-"""What `_weighted_groups` has found, as the panel asks at each redraw."""
+"""Cache of `_weighted_groups`, which the panel calls at each redraw."""
 
 
 def _weighted_groups(mesh: bpy.types.Object) -> frozenset[str]:
-    """Return the names of the vertex groups that have vertices."""
+    """Return the names of the vertex groups with weighted vertices."""
     names = tuple(one.name for one in mesh.vertex_groups)
     key = (mesh.data.session_uid, len(mesh.data.vertices), names)
     if key not in _groups:
@@ -181,13 +181,13 @@ def _weighted_groups(mesh: bpy.types.Object) -> frozenset[str]:
 def _join_roots(
     above: dict[int, int], moving: set[int], heads: np.ndarray, tails: np.ndarray
 ) -> None:
-    """Hang all trees of bones that move something on one, each on the bone nearest to it.
+    """Join all trees of bones that move something to the trunk, each at the bone nearest to it.
 
-    That one is the trunk: the tree from which the others begin the nearest.
+    The trunk is the tree with the least sum of distances to the roots of all trees.
     """
 
     def top(at: int) -> int:
-        """Return the highest bone over one that moves something."""
+        """Return the highest ancestor of a bone, itself included, that moves something."""
         highest = at
         while at >= 0:
             highest, at = (at if at in moving else highest), above[at]
@@ -213,7 +213,7 @@ def _join_roots(
 
 
 def _distances(points: np.ndarray, heads: np.ndarray, tails: np.ndarray) -> np.ndarray:
-    """Return the (N, M) distances of (N, 3) points from bones, of (M, 3) heads and tails."""
+    """Return the (N, M) distances of (N, 3) points from bones with (M, 3) heads and tails."""
     bones, from_heads = tails - heads, points[:, None] - heads
     squares = np.maximum((bones * bones).sum(axis=1), 1e-30)
     share = np.clip((from_heads * bones).sum(axis=2) / squares, 0.0, 1.0)
