@@ -347,7 +347,7 @@ class Body(ABC):
 
     @property
     def ground(self) -> tuple[float, npt.NDArray[np.bool_]] | None:
-        """Normalised height of the ground and a (V,) mask of its vertices; None without ground."""
+        """Normalised height of the ground and a (V,) mask of the other vertices; None without."""
         return None
 
     def without_ground(self, vertices: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -1,4 +1,4 @@
-"""What touches on the body that a motion was made for, as patches of the body that it moves."""
+"""Contacts of the body that a motion was made for, as patches of the body that it moves."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ from lcollision_core.motion.contacts import KeptContacts, Touch
 from lcollision_core.motion.motion import STILL, runs
 
 _TOUCHING = 0.01
-"""Normalised: what is nearer on the body that the motion was made for touches."""
+"""Normalised distance below which parts of the source body touch."""
 
 _PATCH, _SOLE_PATCH = 0.03, 0.04
-"""Normalised: the radius of a patch at rest, and that of one on the ground."""
+"""Normalised radius of a patch at rest, and of a patch on the ground."""
 
 _STEADY = 2.0
-"""Frames over which the middles of patches that slide are evened."""
+"""Smoothing of the centres of sliding patches, in frames."""
 
 _TRUNK = -1
-"""Stands for all joints of the trunk, which rigs divide in their own ways."""
+"""Limb index of all joints of the trunk, which rigs divide differently."""
 
 _ALONG, _AROUND, _ACROSS = 2.0, 0.7, 0.5
-"""Weights of what places on two limbs are compared by: how far along, in which direction from the
-middle, and how far out."""
+"""Weights for comparing places on two limbs: position along the limb, direction from its middle,
+and distance outwards."""
 
 _ENDS = (2.0, 98.0)
-"""Percentiles between which a limb lies along an axis."""
+"""Percentiles that bound a limb along an axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class Correspondence:
-    """Which place of a body another body's places are.
+    """A correspondence between the vertices of two bodies.
 
-    Joints that follow each other carry the same limb. On that, places correspond that lie as far
-    along it, and in the same direction from its middle; on the same mesh they are the same.
+    Joints that follow each other carry the same limb. On it, vertices correspond if they lie
+    equally far along it and in the same direction from its middle; on equal meshes they are equal.
 
     Attributes
     ----------
-    retargeting : from the other's skeleton
-    source : the other's poses
-    motion, source_motion : one motion of both, frame by frame
+    retargeting : from the source skeleton
+    source : the source body's pose space
+    motion, source_motion : the motion of each, frame by frame
     """
 
     retargeting: Retargeting
@@ -70,12 +70,12 @@ class Correspondence:
 
     @cached_property
     def image(self) -> npt.NDArray[np.int64]:
-        """For each of the other's vertices the body's vertex that it is, -1 for none."""
+        """The body's vertex for each of the source's vertices, -1 for none."""
         same = self.source.topology == self.retargeting.space.topology
         return np.arange(len(self.limbs)) if same else self.by_place()
 
     def by_place(self) -> npt.NDArray[np.int64]:
-        """Find `image` limb by limb, whatever the faces are."""
+        """Find `image` limb by limb, independent of the topologies."""
         space, source, frame = self.retargeting.space, self.source, self._least_bent
         partner, trunk = self.retargeting.partner, _trunk(space)
         listed = [*enumerate(self.retargeting.motion.names)]
@@ -95,7 +95,7 @@ class Correspondence:
                 continue
             first = _first(source, inside, limb), _first(space, own, limb)
             turned = between @ turns[0][first[0]], turns[1][first[1]]
-            # As the frame turns them, limbs point the same way, however they do so at rest.
+            # In the frame's pose, limbs point the same way, whatever their rest poses.
             points = (
                 (source.rest_vertices[inside] - source.origins[first[0]]) @ turned[0].T,
                 (space.rest_vertices[own] - space.origins[first[1]]) @ turned[1].T,
@@ -112,7 +112,7 @@ class Correspondence:
         return int(np.abs(self.motion.codes[:, ROOT_CODES:]).sum(axis=1).argmin())
 
     def patch(self, middle: FloatArray, limb: int, radius: float) -> npt.NDArray[np.intp]:
-        """Return the faces of a limb round a place at rest, at least one."""
+        """Return the faces of a limb near a place at rest, at least one."""
         by_limb, middles = self._faces
         faces = by_limb[limb]
         away = np.linalg.norm(middles[faces] - middle, axis=1)
@@ -134,7 +134,7 @@ def _trunk(space: RigPoseSpace) -> set[int]:
 
 
 def _limbs(space: RigPoseSpace, known: Sequence[int], trunk: set[int]) -> npt.NDArray[np.int64]:
-    """Return the limb of each joint: that which is known of it, else that of its parent."""
+    """Return the limb of each joint: the known one, else its parent's."""
     limbs = np.full(len(known), _TRUNK, dtype=np.int64)
     for joint, parent in enumerate(space.rig.parents.tolist()):
         if joint in trunk:
@@ -155,14 +155,14 @@ def _heaviest(space: RigPoseSpace) -> npt.NDArray[np.int64]:
 
 
 def _first(space: RigPoseSpace, vertices: npt.NDArray[np.intp], limb: int) -> int:
-    """Return the first joint of a limb's vertices; of the trunk the root."""
+    """Return the first joint of a limb's vertices; for the trunk, the root."""
     if limb == _TRUNK:
         return max(int(space.joint_of_code[0]), 0)
     return int(_heaviest(space)[vertices].min())
 
 
 def _turns(space: RigPoseSpace, motion: Motion, frame: int) -> FloatArray:
-    """Return how each joint is turned from rest in a frame: (J, 3, 3)."""
+    """Return the rotation of each joint from rest in a frame: (J, 3, 3)."""
     own = motion.space(frame, space)
     assert isinstance(own, RigPoseSpace)
     moved = own.transforms(motion.codes[frame]) @ np.linalg.inv(space.rig.rest)
@@ -172,7 +172,7 @@ def _turns(space: RigPoseSpace, motion: Motion, frame: int) -> FloatArray:
 
 
 def _places(points: FloatArray, axis: FloatArray, front: FloatArray, up: FloatArray) -> FloatArray:
-    """Return where (n, 3) points lie along and around an axis: (n, 5) weighted numbers."""
+    """Return weighted coordinates of (n, 3) points along and around an axis: (n, 5)."""
     along = axis / np.linalg.norm(axis)
     beside = front if abs(along @ front) < 0.7 else up
     beside = beside - (beside @ along) * along
@@ -188,8 +188,8 @@ def _places(points: FloatArray, axis: FloatArray, front: FloatArray, up: FloatAr
 
 
 _SPACING, _AT_REST = 0.007, 0.03
-"""Normalised: how far apart samples of a surface are, and what is so near at rest that it does not
-touch in a pose."""
+"""Normalised: distance between samples of a surface; and distance at rest below which contacts in
+a pose are ignored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +199,7 @@ class _Samples:
     Attributes
     ----------
     faces, rest : of the body
-    face, weights : (S,) and (S, 3) of each point
+    face, weights : (S,) and (S, 3), face and barycentric weights of each point
     part : (S,) its body part
     """
 
@@ -234,12 +234,12 @@ class _Samples:
     def touching(
         self, vertices: FloatArray, adjacent: set[tuple[int, int]]
     ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-        """Return the parts that touch in a pose, and a vertex in the middle of where each does.
+        """Return the parts that touch in a pose, with a vertex at the centre of each contact.
 
         Parameters
         ----------
         vertices : (V, 3) of the pose, normalised
-        adjacent : pairs of parts that are not looked at
+        adjacent : pairs of parts to skip
         """
         points, at_rest = (
             _at(pose, self.faces, self.face, self.weights) for pose in (vertices, self.rest)
@@ -287,11 +287,11 @@ def _at(
 
 @dataclass(eq=False)
 class _Found:
-    """A contact of the other body.
+    """A contact of the source body.
 
     Attributes
     ----------
-    vertices : by frame, of each of its sides the vertex in the middle
+    vertices : the central vertex on each side, by frame
     """
 
     name: tuple[str, str]
@@ -301,19 +301,19 @@ class _Found:
 def contacts_of(
     body: Body, motion: Motion, source: Body, source_motion: Motion, retargeting: Retargeting
 ) -> KeptContacts:
-    """Return what touches on the body that a motion was made for, frame by frame.
+    """Return the contacts of the body that a motion was made for, frame by frame.
 
-    Parts touch whose faces come nearer than 1 % of the body size, by that body's own contact rules;
-    of two parts, the patches round the middle of where they do. What lies on the ground, the lowest
-    point of the motion, is divided into patches, of which those that hardly move stand.
+    Parts touch if their faces come within 1 % of the body size; their contact patches surround the
+    centres of the touching faces. Surfaces on the ground, the lowest point of the motion, are
+    divided into patches, and those that hardly move stand.
 
     Parameters
     ----------
-    body : that the motion moves
+    body : the body that the motion moves
     motion : its poses
-    source : that the motion was made for
-    source_motion : its poses, at the same times and maybe others
-    retargeting : from the one to the other
+    source : the body that the motion was made for
+    source_motion : the source's poses, at the same times or more densely
+    retargeting : from the source to the body
     """
     assert isinstance(body.space, RigPoseSpace)
     assert isinstance(source.space, RigPoseSpace)
@@ -363,7 +363,7 @@ def contacts_of(
 
 
 def _frames_at(motion: Motion, frames: npt.NDArray[np.intp]) -> Motion:
-    """Return the frames of a motion that are at others' times."""
+    """Return a motion made of given frames of another."""
     own, hidden = motion.space_at, motion.hidden
     return replace(
         motion,
@@ -379,7 +379,7 @@ def _frames_at(motion: Motion, frames: npt.NDArray[np.intp]) -> Motion:
 
 
 class _Decoded:
-    """The vertices of a motion's frames, of which the last are kept."""
+    """The vertices of a motion's frames, cached."""
 
     def __init__(self, space: RigPoseSpace, motion: Motion) -> None:
         self._space, self._motion = space, motion
@@ -393,7 +393,7 @@ class _Decoded:
 
 
 def _adjacent(space: RigPoseSpace) -> set[tuple[int, int]]:
-    """Return pairs of body parts that a joint links, the smaller number first."""
+    """Return pairs of body parts that a joint links, smaller index first."""
     parts, parents = space.part_of_joint, space.rig.parents
     return {
         (min(a, b), max(a, b))
@@ -405,7 +405,7 @@ def _adjacent(space: RigPoseSpace) -> set[tuple[int, int]]:
 def _sliding(
     both: Correspondence, vertices: Sequence[tuple[int, int]]
 ) -> list[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]] | None:
-    """Return the patches of a contact in successive frames; None where the body has no such."""
+    """Return the patches of a contact in successive frames; None if the body lacks them."""
     sides = []
     for side in (0, 1):
         images = both.image[[pair[side] for pair in vertices]]
@@ -423,18 +423,18 @@ def _sliding(
 def _soles(
     source: Body, both: Correspondence, heights: FloatArray, level: FloatArray, rate: float
 ) -> Iterator[tuple[str, npt.NDArray[np.intp], npt.NDArray[np.bool_], npt.NDArray[np.bool_]]]:
-    """Divide what comes to the ground into patches.
+    """Divide surfaces that touch the ground into patches.
 
     Parameters
     ----------
-    heights, level : (T, V) and (T, V, 3) where the other body's vertices are
-    rate : frames a second
+    heights, level : (T, V) heights and (T, V, 3) horizontal positions of the source's vertices
+    rate : frame rate
 
     Yields
     ------
     name : of the body part
     patch : of the body
-    on_ground, still : (T,) when it is there, and when it stays in its place
+    on_ground, still : (T,) when it is on the ground, and when it stays in place
     """
     space = both.source
     low = heights < heights.min() + _TOUCHING
@@ -458,7 +458,7 @@ def _soles(
             still = np.zeros(len(low), dtype=np.bool_)
             still[1:] |= step & on_ground[1:] & on_ground[:-1]
             still[:-1] |= step & on_ground[1:] & on_ground[:-1]
-            # One patch holds the part in its place.
+            # One patch per part keeps it in place.
             still &= ~stood
             stood |= still
             patch = both.patch(own, limb, _SOLE_PATCH)

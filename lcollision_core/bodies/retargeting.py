@@ -1,4 +1,4 @@
-"""Motions of another skeleton on a rig, and files of skeletons' motions."""
+"""Retarget motions between skeletons, and write skeletal motion files."""
 
 from __future__ import annotations
 
@@ -61,30 +61,30 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import Motion
 
 _SHORT, _SHORT_BONE = 1e-9, 0.02
-"""What has no length; and of the size, bones whose ways say little."""
+"""Length regarded as zero; and the share of the size below which a bone has no clear direction."""
 
 _MOST_ALIKE, _UPRIGHT = 0.8, 0.9
-"""Share of a rig's bones that lie as in another that is the same; cosine of a trunk upright."""
+"""Least share of equally aligned bones for equal rigs; and least cosine of an upright trunk."""
 
 
 @dataclass(frozen=True, eq=False)
 class Retargeting:
-    """How a skeleton in motion carries a rig.
+    """A mapping of a skeleton's motion to a rig.
 
-    Each joint of the rig that has a partner turns in the world as that does, from rest poses that
-    are brought to point the same ways; others go along with what they hang on. The hips' way is
-    scaled by the length of the legs.
+    Each joint of the rig with a partner has its world rotation, relative to rest poses whose limbs
+    are aligned; other joints follow their parents. The hips' translation is scaled by the length of
+    the legs.
 
     Attributes
     ----------
-    motion : the skeleton, with a rest pose that stands
+    motion : the skeleton, with a standing rest pose
     space : of the rig
-    partner : (J,) int64 array, the skeleton's joint for each of the rig's, -1 for none
+    partner : (J,) int64 array, the skeleton joint of each rig joint, -1 for none
     frame : (3, 3) rotation from the skeleton's axes to the character's
-    aligned : (J, 3, 3) rotations, from the rig's rest pose to one that points as the skeleton's
-    share : (J,) how much of its partner's turn each joint makes, where several of a spine have one
+    aligned : (J, 3, 3) rotations from the rig's rest pose to one aligned with the skeleton's
+    share : (J,) share of the partner's turn in each joint, as several spine joints may share one
     scale : from the skeleton's unit to the character's
-    is_same_rig : whether both are one rig, so that they are in one place as well
+    is_same_rig : whether both are the same rig, so that positions match too
     """
 
     motion: RestedMotion
@@ -98,7 +98,7 @@ class Retargeting:
 
     @classmethod
     def of(cls, stored: SkeletonMotion, space: RigPoseSpace, path: Path) -> Retargeting:
-        """Find partners by the joints' names, else by what they are in the body.
+        """Match joints by name, else by role, and build the mapping.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class Retargeting:
 
         Raises
         ------
-        MeshFileError : the two have too few limbs in common.
+        MeshFileError : they share too few limbs.
         """
         other = MeshFileError(
             "has joints that match the body's neither by name nor by place",
@@ -145,11 +145,11 @@ class Retargeting:
 
     @property
     def _hips(self) -> int:
-        """The rig's joint that the skeleton places, -1 where the rig has no such root."""
+        """The rig's joint that the skeleton translates, -1 if the rig has no such root."""
         return int(self.space.joint_of_code[0])
 
     def transforms(self) -> FloatArray:
-        """Return the global transforms of the rig's joints: (T, J, 4, 4), as `Rig.rest`."""
+        """Return the global transforms of the rig's joints: (T, J, 4, 4), as in `Rig.rest`."""
         rig = self.space.rig
         turns, places = in_world(self.motion)
         n_frames, n_joints = len(turns), len(rig.parents)
@@ -180,24 +180,24 @@ class Retargeting:
     def changed(
         self, frames: Sequence[int], before: FloatArray, after: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return some frames of the skeleton that differ as the rig's do.
+        """Apply changes of the rig's frames to the skeleton's.
 
         Parameters
         ----------
-        frames : n numbers of frames, ascending
+        frames : indices of n frames, ascending
         before, after : (n, J, 4, 4) transforms of the rig's joints
 
         Returns
         -------
-        turns : (n, J, 3, 3) rotations of the skeleton's joints against their parents
-        roots : (n, 3) places of its root
+        turns : (n, J, 3, 3) rotations of the skeleton's joints relative to their parents
+        roots : (n, 3) positions of its root
         """
         chosen = list(frames)
         turns, _ = in_world(self.motion)
         old_turns, local = turns[chosen], self.motion.turns()[chosen]
         rest = np.linalg.inv(self.space.rig.rest)
         difference = (after @ rest)[..., :3, :3] @ np.linalg.inv((before @ rest)[..., :3, :3])
-        # Of several that follow one joint, the last carries what hangs on it.
+        # If several joints follow one, the last carries its children.
         follower = {int(partner): joint for joint, partner in enumerate(self.partner)}
         new_turns = np.empty_like(old_turns)
         for joint, parent in enumerate(self.motion.parents.tolist()):
@@ -214,14 +214,14 @@ class Retargeting:
         return self.motion.turns_as_stored(local), roots
 
     def _rest_of(self, joint: int) -> FloatArray:
-        """Return where a joint of the skeleton is while the character is at rest."""
+        """Return the position of a skeleton joint when the character is at rest."""
         if self.is_same_rig:
             own: FloatArray = self.space.rig.rest[self._hips, :3, 3] @ self.frame / self.scale
             return own
         rest = rest_places(self.motion)
         up = self.frame.T @ self.space.up
         if rest[0] @ up <= 0.0:
-            # The root has no place of its own: it stands on the ground.
+            # The root has no position of its own: let the skeleton stand on the ground.
             ends = rest + np.nan_to_num(self.motion.ends)
             rest = rest - (ends @ up).min() * up
         place: FloatArray = rest[joint]
@@ -231,11 +231,11 @@ class Retargeting:
 def _followed(
     motion: RestedMotion, rest: FloatArray, space: RigPoseSpace, path: Path
 ) -> tuple[Character, Anatomy, npt.NDArray[np.int64], frozenset[str]]:
-    """Return a skeleton as a figure, its joints, which of them a rig's follow, and what is unsure.
+    """Return a skeleton's figure, its anatomy, each rig joint's partner, and unsure joints.
 
     Parameters
     ----------
-    rest : (J, 3) places of its joints
+    rest : (J, 3) positions of its joints
     """
     chosen = chosen_for(motion, space, path)
     figure = as_chosen(stick_figure(motion, rest, motion.up), chosen, space)
@@ -246,9 +246,9 @@ def _followed(
 
 
 def joint_match(body: Body, path: Path) -> JointMatch | None:
-    """Return which joint goes where when a body follows the motions of a file.
+    """Return how a body's joints match those of a file's motions.
 
-    None where the body has no joints, or the file's skeleton has too few to be one.
+    None if the body has no joints, or the file's skeleton has too few.
 
     Raises
     ------
@@ -265,7 +265,7 @@ def joint_match(body: Body, path: Path) -> JointMatch | None:
 
 
 def _facing(anatomy: Anatomy, front: FloatArray | None) -> Anatomy:
-    """Return an anatomy that faces a given way, where that is known."""
+    """Return an anatomy with a given front, if known."""
     if front is None:
         return anatomy
     if anatomy.front @ front > 0.0:
@@ -275,15 +275,15 @@ def _facing(anatomy: Anatomy, front: FloatArray | None) -> Anatomy:
 
 
 _SAME_BONE, _ALIKE, _TWISTED = np.cos(np.radians([5.0, 30.0, 60.0]))
-"""Cosines: of bones of limbs and of others in the axes of two rigs that are one, and of the turn
-about the bone of a hinge that no pose makes."""
+"""Least cosines: for bones of limbs and for other bones in the axes of equal rigs, and for the
+twist of a hinge, which no pose makes."""
 
 
 def _as_the_rig(motion: NodeMotion, space: RigPoseSpace) -> RestedMotion | None:
-    """Return a motion of a rig's own joints with the rig's rest pose; None of other joints.
+    """Return a motion of a rig's own joints with the rig's rest pose; None for other joints.
 
-    Joints are the rig's own where they are called so and their bones lie in their axes as the
-    rig's do, whatever pose their file stores, and however long they are.
+    Joints are the rig's own if they have its names and their bones have the same local directions,
+    whatever pose the file stores, and whatever their lengths.
     """
     rig, partner = space.rig, named_alike(motion, space)
     if len(followed_limbs(partner, space)) < LEAST_JOINTS:
@@ -327,8 +327,8 @@ def _axes_of_rig(
 ) -> FloatArray:
     """Return the rotation from the axes of a rig's own motion to the rig's.
 
-    That in which its trunk is stored nearly as the rig's; else, as of one that lies, among those in
-    which the file's up is the rig's.
+    It is the one in which the trunk is stored nearly as in the rig; if the trunk lies, it is
+    restricted to those that match the file's up axis.
 
     Parameters
     ----------
@@ -348,13 +348,13 @@ def _axes_of_rig(
 
 
 def _twist(turn: FloatArray, axis: FloatArray) -> float:
-    """Return the cosine of the part of a rotation that is about an axis."""
+    """Return the cosine of a rotation's twist about an axis."""
     about = least_turn(axis, turn @ axis).T @ turn
     return float(0.5 * (np.trace(about) - 1.0))
 
 
 def _leg_length(rig: Rig, roles: Sequence[Role]) -> float:
-    """Return the mean length of thigh and shin together, the rig's extent without legs."""
+    """Return the mean length of thigh plus shin; without legs, the rig's extent."""
     places, below = rig.rest[:, :3, 3], next_in_limb(rig, roles)
     bones = [
         float(np.linalg.norm(places[below[joint]] - places[joint]))
@@ -395,18 +395,18 @@ _NEEDED = (
         if role not in (Role.SHOULDER, Role.TOE)
     ),
 )
-"""Bones that a humanoid of VRM must have."""
+"""Bones that VRM requires of a humanoid."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Moved:
-    """A rig in motion, in axes in which x is its left, y up, and z its front.
+    """A moving rig, in axes with x to its left, y up and z to its front.
 
     Attributes
     ----------
-    rest : (J, 3) where the joints are at rest
-    turns : (T, J, 3, 3) rotations of the joints from the rest pose, in the world
-    places : (T, J, 3) where they are
+    rest : (J, 3) joint positions at rest
+    turns : (T, J, 3, 3) world rotations of the joints from the rest pose
+    places : (T, J, 3) joint positions
     """
 
     rest: FloatArray
@@ -417,7 +417,7 @@ class _Moved:
     def of(cls, space: RigPoseSpace, transforms: FloatArray) -> _Moved:
         axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
         linear = transforms[..., :3, :3] @ np.linalg.inv(space.rig.rest[:, :3, :3])
-        # What a skeleton cannot hold, as scales of joints are, is left out.
+        # Leave out what a skeleton cannot represent, such as scaled joints.
         left, _, right = np.linalg.svd(linear)
         return cls(
             space.rig.rest[:, :3, 3] @ axes.T,
@@ -426,7 +426,7 @@ class _Moved:
         )
 
     def seen_from(self, parents: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Return the turns and the places of the joints as their parents see them."""
+        """Return the rotations and positions of the joints relative to their parents."""
         turns, places = self.turns.copy(), self.places.copy()
         for joint, parent in enumerate(parents):
             if parent >= 0:
@@ -438,14 +438,14 @@ class _Moved:
 
 
 def bvh_of(space: RigPoseSpace, transforms: FloatArray, frame_time: float) -> bytes:
-    """Return the BVH file of a rig in motion: y up, z to its front, lengths in its own unit.
+    """Return a BVH file of a moving rig: y up, z to its front, in its own unit.
 
-    Its rest pose is the rig's. Where the rig has several roots, they hang on one at the origin.
+    The rest pose is the rig's. Several roots get a common parent at the origin.
 
     Parameters
     ----------
-    transforms : (T, J, 4, 4) global transforms of the joints, as `Rig.rest`
-    frame_time : seconds from frame to frame
+    transforms : (T, J, 4, 4) global transforms of the joints, as in `Rig.rest`
+    frame_time : seconds between frames
     """
     moved, parents = _Moved.of(space, transforms), _one_tree(space.rig)
     names, ends = list(space.rig.joint_names), _ends(space)
@@ -463,7 +463,7 @@ def bvh_of(space: RigPoseSpace, transforms: FloatArray, frame_time: float) -> by
 
 
 def held_by_bvh(space: RigPoseSpace, bvh: Bvh) -> FloatArray:
-    """Return the (T, J, 4, 4) transforms of a rig's joints that a file of `bvh_of` holds."""
+    """Return the (T, J, 4, 4) transforms of a rig's joints from a file of `bvh_of`."""
     rig, parents = space.rig, _one_tree(space.rig)
     axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
     turns, places = in_world(bvh)
@@ -476,14 +476,14 @@ def held_by_bvh(space: RigPoseSpace, bvh: Bvh) -> FloatArray:
 
 
 def _one_tree(rig: Rig) -> npt.NDArray[np.int64]:
-    """Return the joints' parents, with a root before them where they have several."""
+    """Return the joints' parents, preceded by a common root if there are several."""
     if np.count_nonzero(rig.parents < 0) == 1:
         return rig.parents
     return np.concatenate([[-1], rig.parents + 1])
 
 
 def _ends(space: RigPoseSpace) -> FloatArray:
-    """Return where bones end at rest, seen from their joints, in the axes of `_Moved`: (J, 3)."""
+    """Return bone ends at rest relative to their joints, in the axes of `_Moved`: (J, 3)."""
     rig = space.rig
     axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
     heaviest, rows = rig.weights.argmax(axis=1), np.arange(len(rig.weights))
@@ -499,19 +499,19 @@ def _ends(space: RigPoseSpace) -> FloatArray:
 def vrma_of(
     character: Character, space: RigPoseSpace, transforms: FloatArray, times: FloatArray
 ) -> bytes:
-    """Return the VRM animation of a rig in motion, in metres, from a T pose that stands on y = 0.
+    """Return a VRM animation of a moving rig, in metres, with a T pose standing on y = 0.
 
-    It holds the turns of the bones that VRM knows, and the way of the hips.
+    It holds the rotations of VRM's bones, and the translation of the hips.
 
     Parameters
     ----------
-    character : with the rig of `space`
-    transforms : (T, J, 4, 4) global transforms of the joints, as `Rig.rest`
+    character : one with the rig of `space`
+    transforms : (T, J, 4, 4) global transforms of the joints, as in `Rig.rest`
     times : (T,) in seconds, ascending
 
     Raises
     ------
-    MeshFileError : the rig lacks bones that VRM needs.
+    MeshFileError : the rig lacks bones that VRM requires.
     """
     is_avatar, bones = _bones(character, space)
     joints = [bones[name] for name in bones]
@@ -530,23 +530,23 @@ def vrma_of(
 
 
 def require_humanoid(character: Character, space: RigPoseSpace) -> None:
-    """Refuse a rig that a VRM animation cannot be of.
+    """Raise unless a rig can have a VRM animation.
 
     Raises
     ------
-    MeshFileError : it lacks bones that VRM needs.
+    MeshFileError : it lacks bones that VRM requires.
     """
     _bones(character, space)
 
 
 def _bones(character: Character, space: RigPoseSpace) -> tuple[bool, dict[str, int]]:
-    """Return whether a file says what its bones are, and the joint of each, parents first."""
+    """Return whether the file names its VRM bones, and the joint of each bone, parents first."""
     rig, bones = space.rig, dict[str, int]()
     if is_gltf(character) and character.file is not None:
         said, nodes = human_bones(character.file.document), rig.nodes.tolist()
         known = {node: bone for node, bone in said.items() if not bone.endswith("Eye")}
         bones = {known[node]: joint for joint, node in enumerate(nodes) if node in known}
-        # VRM 0 counts the joints of a thumb from one farther on.
+        # VRM 0 names the joints of a thumb one further along.
         for side in ("left", "right"):
             if f"{side}ThumbIntermediate" in bones:
                 own = [bones.pop(f"{side}Thumb{name}", None) for name in _PHALANGES[Role.FINGER]]
@@ -567,7 +567,7 @@ def _bones(character: Character, space: RigPoseSpace) -> tuple[bool, dict[str, i
 
 
 def _recognised(space: RigPoseSpace) -> dict[str, int]:
-    """Return which joint is which bone of VRM, by what the joints are."""
+    """Return the joint of each VRM bone, by the joints' roles."""
     rig, roles, sides = space.rig, space.roles, space.sides
     kinds, in_limb = list(zip(roles, sides, strict=True)), set(next_in_limb(rig, roles).values())
     joints: dict[str, int] = {}
@@ -575,7 +575,7 @@ def _recognised(space: RigPoseSpace) -> dict[str, int]:
         for role, name in _LIMBS.items():
             if (role, side) in kinds:
                 own = [joint for joint, kind in enumerate(kinds) if kind == (role, side)]
-                # Not a target of inverse kinematics, which is called so too.
+                # Not an IK target, which may have the same name.
                 joints[f"{side.value}{name}"] = min(own, key=lambda joint: joint not in in_limb)
     fingers = finger_joints(rig.joint_names, rig.parents, roles, sides)
     for (side, finger, number), joint in fingers.items():
@@ -601,7 +601,7 @@ def _recognised(space: RigPoseSpace) -> dict[str, int]:
 
 
 def _above(rig: Rig, joint: int) -> list[int]:
-    """Return what a joint hangs on, from the root on."""
+    """Return a joint's ancestors, from the root."""
     way = []
     while (joint := int(rig.parents[joint])) >= 0:
         way.append(joint)
@@ -609,7 +609,7 @@ def _above(rig: Rig, joint: int) -> list[int]:
 
 
 def _parents(rig: Rig, joints: Sequence[int]) -> list[int]:
-    """Return which of some joints each of them hangs on next, -1 for the first."""
+    """Return each joint's nearest ancestor among the given joints, -1 for the first."""
     number = {joint: place for place, joint in enumerate(joints)}
     return [
         next(
@@ -627,15 +627,15 @@ def _t_pose(
     parents: Sequence[int],
     is_there: bool,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how the T pose turns each of B bones from the rest pose, and where they are in it.
+    """Return the rotations of B bones from the rest pose to a T pose, and their positions in it.
 
-    Arms lie along x and legs along y, feet and trunk are as at rest.
+    Arms lie along x and legs along y; feet and trunk stay as at rest.
 
     Parameters
     ----------
-    rest : (J, 3) places of the joints
+    rest : (J, 3) joint positions
     parents : of the bones
-    is_there : whether the rest pose is a T pose
+    is_there : whether the rest pose is a T pose already
     """
     joints, next_bone = list(bones.values()), next_in_limb(space.rig, space.roles)
     turned = np.broadcast_to(np.eye(3), (len(joints), 3, 3)).copy()
@@ -659,23 +659,23 @@ def _t_pose(
 
 
 _SAME = 1e-4
-"""Normalised: what a skeleton holds of a frame to so much, it holds."""
+"""Normalised tolerance within which a skeleton represents a frame."""
 
 
 def carried_motions(
     body: Body, path: Path, clip: str | None = None, fps: float | None = None
 ) -> list[tuple[Motion, Retargeting]]:
-    """Read the motions of a skeleton, carried by the joints of a character, and how they are.
+    """Read a skeleton's motions, retargeted to a character; return them with their mappings.
 
     Parameters
     ----------
     path : a .bvh or .vrma file, arrays of a generator, or a scene, whose clips are motions
-    clip : one of the clips of a scene by its name; None for all of them
-    fps : frames a second; None for the rate of the file. A BVH file has the frames that it has.
+    clip : one of the clips of a scene; None for all of them
+    fps : frame rate; None for the file's. BVH files are not resampled.
 
     Raises
     ------
-    MeshFileError : the file is damaged, or the body has no such skeleton.
+    MeshFileError : the file is damaged, or the body has no matching skeleton.
     """
     space = rig_space_of(body, path)
     motions = []
@@ -685,7 +685,7 @@ def carried_motions(
             times = np.arange(len(times), dtype=np.float64) / fps
         carrying = Retargeting.of(motion, space, path)
         codes = space.unwound(space.codes_of_transforms(carrying.transforms()))
-        # VRM animations are called after what wrote them.
+        # VRM animations are named after the program that wrote them.
         is_vrma = path.suffix.lower() == VRMA_SUFFIX
         name = motion.name if isinstance(motion, NodeMotion) and not is_vrma else ""
         motions.append((Motion(name or path.stem, times, codes, source=path.name), carrying))
@@ -693,11 +693,11 @@ def carried_motions(
 
 
 def skeleton_notes(body: Body, path: Path) -> tuple[str, ...]:
-    """Return sentences on what a file of a skeleton does not say, or what is left out of it.
+    """Return sentences on assumptions about a skeleton's file, and what is left out of it.
 
     Raises
     ------
-    MeshFileError : the file is damaged, or the body has no such skeleton.
+    MeshFileError : the file is damaged, or the body has no matching skeleton.
     """
     motion = _read(path, most=_MOST_LOOKED_AT)[0]
     notes = motion.notes if isinstance(motion, NodeMotion) else ()
@@ -715,13 +715,13 @@ def skeleton_notes(body: Body, path: Path) -> tuple[str, ...]:
 
 
 _MOST_LOOKED_AT = 64
-"""Frames of a clip by which its rest pose is found."""
+"""Most frames of a clip that are read to find its rest pose."""
 
 
 def _read(
     path: Path, clip: str | None = None, fps: float | None = None, most: int | None = None
 ) -> Sequence[Bvh | NodeMotion]:
-    """Read a skeleton in motion, at most so many frames of each clip of a scene."""
+    """Read a moving skeleton; `most` limits the frames read of each clip of a scene."""
     if path.suffix.lower() == BVH_SUFFIX:
         return [read_bvh(path)]
     if path.suffix.lower() == VRMA_SUFFIX:
@@ -736,11 +736,11 @@ def _read(
 
 
 def rig_space_of(body: Body, path: Path) -> RigPoseSpace:
-    """Return the poses of a body's joints, which the motion of a skeleton needs.
+    """Return the pose space of a body's joints, which the motion of a skeleton needs.
 
     Raises
     ------
-    MeshFileError : it has none.
+    MeshFileError : the body has no joints.
     """
     if isinstance(body.space, RigPoseSpace):
         return body.space
@@ -752,13 +752,13 @@ def rig_space_of(body: Body, path: Path) -> RigPoseSpace:
 
 
 def require_skeleton(path: str | os.PathLike[str], body: Body) -> None:
-    """Refuse a file of a skeleton for a body that has none, or not the bones that it needs.
+    """Raise early if a skeletal file cannot be written for a body.
 
-    Other files are left alone.
+    Other files are not checked.
 
     Raises
     ------
-    MeshFileError : the body has no joints, or lacks bones that VRM needs.
+    MeshFileError : the body has no joints, or lacks bones that VRM requires.
     """
     if Path(path).suffix.lower() not in SKELETON_SUFFIXES:
         return
@@ -777,24 +777,24 @@ def write_skeleton(
     vertices: Iterable[npt.NDArray[Any]],
     fps: float,
 ) -> tuple[Callable[[int], npt.NDArray[Any]], tuple[str, ...]]:
-    """Write poses as the motion of the body's joints, whole or not at all.
+    """Write poses as the motion of the body's joints, atomically.
 
     Parameters
     ----------
     path : a .bvh or .vrma file
-    body : a character, of the poses
-    latents : N poses' (D,) codes
-    vertices : of N poses, each (V, 3), what the body shows of them
-    fps : frames a second
+    body : a character
+    latents : (D,) codes of N poses
+    vertices : displayed vertices of N poses, each (V, 3)
+    fps : frame rate
 
     Returns
     -------
-    stored : returns what the body shows of a frame of the file, (V, 3)
-    notes : sentences on what the file lacks
+    stored : returns the displayed vertices of a frame as stored in the file, (V, 3)
+    notes : sentences about what the file lacks
 
     Raises
     ------
-    MeshFileError : as of `require_skeleton`, or the file cannot be written.
+    MeshFileError : see `require_skeleton`, or the file cannot be written.
     """
     require_skeleton(path, body)
     assert isinstance(body, RigBody)
@@ -807,7 +807,7 @@ def write_skeleton(
     with atomic_write(path) as out:
         out.write(data)
     if is_bvh:
-        # Of a body of any kind, which another may not be able to follow.
+        # Any rig can read back its own BVH file; retargeting might not match it.
         kept = held_by_bvh(body.space, read_bvh(path))
     else:
         ((back, _),) = carried_motions(body, Path(path), fps=fps)
@@ -818,7 +818,7 @@ def write_skeleton(
     def stored(frame: int) -> npt.NDArray[Any]:
         return (space.skinned(kept[frame]) * size).astype(np.float32)
 
-    # Frame by frame: all of them may take more memory than there is.
+    # Lazily: all frames at once may not fit in memory.
     pairs = zip(range(len(kept)), vertices, strict=True)
     off = max(float(np.abs(stored(frame) - shown).max()) for frame, shown in pairs) / size
     notes: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""Several bodies in one scene, posed, checked and resolved as one body."""
+"""A scene of several bodies, posed, checked and resolved as one body."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from lcollision_core.resolve.problem import CollisionModel
 
 _GAP = 0.01
-"""Normalised: what bodies are apart in poses that are known to be free."""
+"""Normalised gap between bodies in poses that are assumed to be free."""
 
 _GREY = "#808080"
 
@@ -52,19 +52,19 @@ _MOST_BODIES = 64
 
 @dataclass(frozen=True)
 class ScenePart:
-    """A body of a scene, as its file says it.
+    """A body of a scene, as stored in the scene file.
 
     Attributes
     ----------
-    file : of the body, relative to the scene's file or absolute; or the name of a model
+    file : of the body, relative to the scene file or absolute; or the name of a model
     name : in the scene; "" for that of the file
-    at : where it stands, in the unit of the scene
+    at : position in the scene's unit
     turn : degrees about the vertical
-    fixed : whether it does not give way
-    held_by, joint : the body and the joint that hold it; "" for nothing
+    fixed : whether it must not move
+    held_by, joint : the body and joint that hold it; "" if none
     counts : whether it takes part in the check
-    clip : that of its own which it plays; "" for the first
-    start : seconds after which it begins
+    clip : the clip of its own file that it plays; "" for the first
+    start : start time of the clip, in seconds
     """
 
     file: str
@@ -81,12 +81,13 @@ class ScenePart:
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What the file of a scene says.
+    """The contents of a scene file.
 
     Attributes
     ----------
-    bodies : the first says unit and axes
-    ground : its height; "rest" for that of what stands lowest at rest; None for no ground
+    bodies : the first one determines unit and axes
+    ground : its height; "rest" for the lowest point of the rest pose; None for no ground
+    path : of the file; "" if there is none
     """
 
     bodies: Annotated[tuple[ScenePart, ...], Meta(min_length=1, max_length=_MOST_BODIES)]
@@ -101,12 +102,12 @@ class SceneMember:
     Attributes
     ----------
     name : unique in the scene
-    body : a character, a prop of one joint, or what only stands there
+    body : a character, a prop with one joint, or a static body
     place : from its unit and coordinates to those of the scene
-    is_fixed : whether it does not give way
-    holder, joint : of what is held, the name of the body that holds it, and the joint of that by
-        its number; None and -1 of all else
-    is_ground : whether it is the ground, on which bodies stand
+    is_fixed : whether it must not move
+    holder, joint : for a held body, the name of its holder and the index of the holder's joint;
+        else None and -1
+    is_ground : whether it is the ground
     """
 
     name: str
@@ -124,32 +125,32 @@ class SceneMember:
 
     @property
     def is_rigid(self) -> bool:
-        """Whether it is a prop, which keeps its shape."""
+        """Whether it is a prop of constant shape."""
         return self.holder is not None or (self.moves and not _bends(self.body))
 
     @property
     def reference(self) -> FloatArray:
-        """(V, 3) where its rest pose stands in the scene, in the unit of that."""
+        """(V, 3) its rest pose in the scene's unit and coordinates."""
         return self.place.apply(self.body.reference)
 
 
 class SceneBody(Body):
-    """Bodies of a scene, as one whose codes are those of all: see `SceneSpace`.
+    """The bodies of a scene as one, with the codes of all: see `SceneSpace`.
 
-    Its unit and axes are those of the first, and lengths are normalised by that. No rule of
-    neighbours holds between bodies, so all their pairs count.
+    Unit and axes are those of the first body, and lengths are normalised by its size. Near and
+    joint exclusions do not apply between bodies, so all their pairs count.
 
     Parameters
     ----------
-    members : in the order in which they are listed, the characters first
+    members : in listing order, characters first
     name : of the scene; by default the names of its bodies
-    file : what its file says, or would say
+    file : contents of its file, or of the file that it would have
 
     Attributes
     ----------
     members, file : as given
-    standing : the members that nothing holds, in the order of `SceneSpace.members`
-    vertices_of, faces_of : of each member by name, its slice of the vertices and of the faces
+    standing : the members that are not held, in the order of `SceneSpace.members`
+    vertices_of, faces_of : slices of each member's vertices and faces, by name
     """
 
     no_sides = ("it has several bodies", "mirror the pose of each by itself")
@@ -193,14 +194,14 @@ class SceneBody(Body):
         )
 
     def with_file(self, file: SceneFile) -> SceneBody:
-        """Return the scene as a file says it that differs in what bodies play."""
+        """Return the scene with a file that differs only in the clips that bodies play."""
         other = copy(self)
         other.file = file
         return other
 
     @cached_property
     def ground(self) -> tuple[float, npt.NDArray[np.bool_]] | None:
-        """Height of the ground, normalised, and (V,) which vertices stand on it; None without."""
+        """Normalised height of the ground and a (V,) mask of the other vertices; None without."""
         for member in self.members:
             if member.is_ground:
                 rows, stands = self.vertices_of[member.name], np.ones(self.n_vertices, np.bool_)
@@ -210,7 +211,7 @@ class SceneBody(Body):
 
     @property
     def plays(self) -> dict[str, tuple[str, float]]:
-        """Of each body that moves and has clips, by its name: the clip, and when it begins."""
+        """Clip and start time, by name, of each moving body that has clips."""
         parts = () if self.file is None else self.file.bodies
         found = {}
         for member, part in zip_longest(self.members, parts[: len(self.members)]):
@@ -222,7 +223,7 @@ class SceneBody(Body):
         return found
 
     def _placed(self, member: SceneMember) -> PlacedSpace:
-        """Return the space of a member with what it holds, and note where these are."""
+        """Return the space of a member and its held bodies, and record their slices."""
         body, place = member.body, member.place
         in_scene = RigidTransform(
             place.rotation,
@@ -267,7 +268,7 @@ class SceneBody(Body):
         return tuple(unique_names(names, MAX_NAME_LENGTH)), tuple(colours)
 
     def _joined_rules(self) -> tuple[ContactRules, tuple[FaceGroup, ...]]:
-        """Return the rules of all bodies, each of which hold within that."""
+        """Return the joint rules of all bodies; each body's rules apply within it."""
         groups: list[FaceGroup] = []
         ignored: list[tuple[str, str]] = []
         left_out: list[str] = []
@@ -327,7 +328,7 @@ class SceneBody(Body):
         )
 
     def _part_of(self, member: SceneMember) -> int:
-        """Return the body part that holds something, of all those of the scene."""
+        """Return the body part that holds a member, as an index into the scene's."""
         at = next(n for n, entry in enumerate(self.standing) if entry.name == member.holder)
         joints = self.standing[at].body.joints
         assert joints is not None
@@ -335,15 +336,15 @@ class SceneBody(Body):
 
     @property
     def space(self) -> SceneSpace:
-        """The poses of all bodies."""
+        """The pose space of all bodies."""
         return self._space
 
     def member(self, name: str) -> SceneMember:
-        """Return a body of the scene by its name.
+        """Return a body of the scene by name.
 
         Raises
         ------
-        LCollisionError : there is none of this name.
+        LCollisionError : there is no such body.
         """
         for member in self.members:
             if member.name == name:
@@ -352,12 +353,12 @@ class SceneBody(Body):
         raise LCollisionError(f"has no body {name!r}", f"its bodies are {names}", where="the scene")
 
     def codes_of_member(self, name: str, latent: FloatArray) -> FloatArray:
-        """Return the (..., D_k) codes of a body that moves, of (..., D) codes."""
+        """Return a moving body's (..., D_k) codes of (..., D) codes."""
         at = next(n for n, entry in enumerate(self.standing) if entry.name == name)
         return self._space.of(latent, at)
 
     def domains_of_member(self, name: str) -> range:
-        """Return the body parts of a body, what it holds among them; none of what is held."""
+        """Return the body parts of a body and what it holds; empty for a held body."""
         for member, own in zip(self.standing, self._space.domains, strict=True):
             if member.name == name:
                 return own
@@ -365,12 +366,12 @@ class SceneBody(Body):
 
     @property
     def fixed_domains(self) -> frozenset[int]:
-        """The body parts of bodies that do not give way."""
+        """The body parts of fixed bodies."""
         fixed = (self.domains_of_member(member.name) for member in self.members if member.is_fixed)
         return frozenset(chain.from_iterable(fixed))
 
     def joined_codes(self, codes: Sequence[FloatArray | None]) -> FloatArray:
-        """Return (D,) codes of those of each member; None and what does not move stay at rest."""
+        """Join (D_k,) codes of the members into (D,); None and static bodies stay at rest."""
         joined = np.zeros(self.latent_size)
         by_name = {member.name: own for member, own in zip(self.members, codes, strict=True)}
         for places, member in zip(self._space.codes, self.standing, strict=True):
@@ -381,10 +382,9 @@ class SceneBody(Body):
 
     @cached_property
     def detector(self) -> CollisionDetector:
-        """Finds collisions within bodies and between them, of meshes in the scene's unit.
+        """Finds collisions within and between bodies, in the scene's unit.
 
-        At rest bodies may be within each other; what touches there is measured body by body, as if
-        they stood apart.
+        Bodies may overlap at rest: contacts at rest are measured with the bodies moved apart.
         """
         apart, end = self.reference.copy(), 0.0
         for member in self.members:
@@ -396,7 +396,7 @@ class SceneBody(Body):
 
     @cached_property
     def fingerprint(self) -> str:
-        """16 hexadecimal digits that identify the bodies, and what holds what."""
+        """16 hexadecimal digits that identify the bodies and which holds which."""
         members = [
             f"{member.body.fingerprint} {member.holder or ''} {member.joint}"
             for member in self.members
@@ -406,12 +406,12 @@ class SceneBody(Body):
 
     @property
     def is_trained(self) -> bool:
-        """The codes are those of the bodies."""
+        """False: the codes are those of the bodies."""
         return False
 
     @property
     def can_resolve(self) -> bool:
-        """Bodies step from poses in which they are apart."""
+        """True: Resolve can step from poses with the bodies apart."""
         return True
 
     @property
@@ -430,7 +430,7 @@ class SceneBody(Body):
 
     @cached_property
     def front(self) -> FloatArray:
-        """(3,) unit vector along an axis: where the first body faces."""
+        """(3,) unit vector along an axis: the direction that the first body faces."""
         return self.members[0].body.front
 
     @property
@@ -440,7 +440,7 @@ class SceneBody(Body):
 
     @cached_property
     def appearance(self) -> Appearance | None:
-        """How the bodies look; reading it takes as long as their textures are large."""
+        """Appearance of the bodies; large textures take long to read."""
         looks = [(member, member.body.appearance) for member in self.members]
         if all(look is None for _, look in looks):
             return None
@@ -475,7 +475,7 @@ class SceneBody(Body):
 
     @cached_property
     def code_effects(self) -> tuple[CodeEffect, ...]:
-        """Those of the bodies."""
+        """The effects of the bodies' codes."""
         effects: dict[int, CodeEffect] = {}
         for member, own, parts in zip(
             self.standing, self._space.codes, self._space.domains, strict=True
@@ -487,7 +487,7 @@ class SceneBody(Body):
 
     @cached_property
     def code_names(self) -> tuple[str, ...]:
-        """D names of the codes; those of whole bodies begin with the body's name."""
+        """D names of the codes; those of whole bodies are prefixed with the body's name."""
         names = [""] * self.latent_size
         n_whole = self._space.group_sizes[0]
         for member, own in zip(self.standing, self._space.codes, strict=True):
@@ -497,7 +497,7 @@ class SceneBody(Body):
 
     @property
     def shape_names(self) -> tuple[str, ...]:
-        """Those of its bodies, which begin with the body's name."""
+        """The bodies' shape names, prefixed with the body's name."""
         return tuple(
             _in_body(member.name, name)
             for member in self.standing
@@ -507,7 +507,7 @@ class SceneBody(Body):
 
     @cached_property
     def code_words(self) -> tuple[str, ...]:
-        """In which people look for a code: those of its body, and its name."""
+        """D search texts, each with the name of the code's body."""
         words = [""] * self.latent_size
         for member, own in zip(self.standing, self._space.codes, strict=True):
             for place, text in zip(own.tolist(), _of_codes(member, "code_words"), strict=True):
@@ -547,7 +547,7 @@ class SceneBody(Body):
         )
 
     def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
-        """Draw (n_poses, D) poses, each body in its place; those that are fixed are at rest."""
+        """Draw (n_poses, D) poses; each body stays in place, and fixed ones at rest."""
         poses = np.zeros((n_poses, self.latent_size))
         for member, own in zip(self.standing, self._space.codes, strict=True):
             if member.moves and not member.is_fixed:
@@ -566,9 +566,9 @@ class SceneBody(Body):
         return LatentFit(latent, np.eye(3), np.zeros(3), float(away.mean()), float(away.max()))
 
     def apart(self, latent: FloatArray) -> list[FloatArray]:
-        """Return poses of (D,) codes moved so that no two bodies meet, and none is in the ground.
+        """Return variants of a (D,) pose with the bodies moved apart and out of the ground.
 
-        Along the line on which they stand, to the side, forward and up.
+        They move along the line on which they stand, sideways, forward or up.
         """
         up = np.eye(3)[self.up_axis]
         decoded = self._space.decode(latent[None])[0]
@@ -609,21 +609,21 @@ class SceneBody(Body):
 
     @cached_property
     def free_latent(self) -> FloatArray:
-        """(F, D) poses at rest in which the bodies are apart, read-only."""
+        """(F, D) collision-free rest poses with the bodies apart, read-only."""
         poses = np.array([np.zeros(self.latent_size), *self.apart(np.zeros(self.latent_size))])
         return read_only(poses[self.exact_check().are_free(poses)])
 
     @cached_property
     def resolver(self) -> PoseResolver:
-        """Resolves collisions within bodies and between them."""
+        """Resolves collisions within and between bodies."""
         return SceneResolver(self.exact_check(), None, self.free_latent, self.starts)
 
     def starts(self, target: FloatArray, check: ExactCheck) -> FloatArray:
-        """Return poses near to a (D,) target, apart, each body free of itself; checked later.
+        """Return poses near a (D,) target with resolved bodies apart; they may still collide.
 
         Parameters
         ----------
-        check : of the scene, whose clearance each body keeps to itself
+        check : of the scene, whose clearance applies within each body too
         """
         if check.is_free(target):
             return np.empty((0, self.latent_size))
@@ -638,20 +638,20 @@ class SceneBody(Body):
 
 
 def as_scene(body: Body) -> SceneBody | None:
-    """Return the scene of several bodies that a body is; None of one body."""
+    """Return a body as a scene of several bodies; None for a single body."""
     return body if isinstance(body, SceneBody) else None
 
 
 class SceneResolver(PoseResolver):
-    """Resolves poses of a scene, from poses in which its bodies are apart.
+    """Resolves poses of a scene, starting with its bodies apart.
 
     Parameters
     ----------
     check, predictor, free_latents : see `PoseResolver`
-    starts : from a target and the check to further poses to begin at
+    starts : maps a target and the check to further starting poses
     """
 
-    # Poses in which bodies are apart are far, and take long to find and to leave.
+    # Poses with the bodies apart are far from the target, and slow to find and to leave.
     _pushes_first = True
 
     def __init__(
@@ -669,22 +669,22 @@ class SceneResolver(PoseResolver):
 
 
 def _in_body(body: str, part: str) -> str:
-    """Name a part of a body of a scene, as in "hero: left hand"."""
+    """Name a part of a scene's body, as in "hero: left hand"."""
     return f"{body}: {part}"
 
 
 def _bends(body: Body) -> bool:
-    """Whether a body has joints that turn against each other."""
+    """Whether a body has joints that turn relative to each other."""
     return body.joints is not None and len(body.space.low) > body.space.group_sizes[0]
 
 
 def _of_codes(member: SceneMember, what: str) -> Sequence[Any]:
-    """Return something of each code of a member; nothing of one that has none."""
+    """Return an attribute with one entry per code of a member; empty for a static one."""
     return cast("Sequence[Any]", getattr(member.body, what)) if member.moves else ()
 
 
 def _plain(body: Body) -> Appearance:
-    """Return the look of a body that has none: white."""
+    """Return a plain white appearance for a body without one."""
     n = body.n_vertices
     return Appearance(
         np.arange(n),
@@ -699,13 +699,13 @@ def _plain(body: Body) -> Appearance:
 def _row(
     along: Sequence[FloatArray], movable: Sequence[bool], bodies: Sequence[int]
 ) -> list[float]:
-    """Return how far bodies are to be shifted along a line until none overlaps another on it.
+    """Return shifts along a line after which no two bodies overlap on it.
 
     Parameters
     ----------
-    along : of each body its vertices along the line
-    movable : which may be shifted
-    bodies : those that are in each other's way
+    along : coordinates of each body's vertices along the line
+    movable : which bodies may be shifted
+    bodies : indices of the bodies to separate
     """
     ends = [(float(item.min()), float(item.max())) for item in along]
     shifts = [0.0] * len(along)

@@ -1,4 +1,4 @@
-"""Read the motions that a body plays: clips of its own, of other files, or of a scene together."""
+"""Read the motions of a body: its own clips, those of other files, or a scene's together."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def read_motions(body: Body, path: Path, clip: str | None, job: Job) -> list[Motion]:
     """Read the motions of a file at their own rate: see `bodies.motions.read_motions`.
 
-    That of a scene is what its bodies do together.
+    A scene's own motion is that of all its bodies together.
     """
     from lcollision_core.bodies import as_scene
     from lcollision_core.bodies.motions import read_motions as read
@@ -33,7 +33,7 @@ def read_motions(body: Body, path: Path, clip: str | None, job: Job) -> list[Mot
 
 
 def own_motions(body: Body) -> tuple[Path | None, tuple[str, ...]]:
-    """Return the file of a body's own motions and their names: of a scene the one of all bodies."""
+    """Return the file and names of a body's own motions; a scene has one motion of all bodies."""
     from lcollision_core.bodies import as_scene
 
     scene = as_scene(body)
@@ -47,13 +47,13 @@ def own_motions(body: Body) -> tuple[Path | None, tuple[str, ...]]:
 
 @dataclass(frozen=True, eq=False)
 class OpenedMotions:
-    """What a file of motions holds.
+    """The contents of a motion file.
 
     Attributes
     ----------
-    body : the body of the motions: the one that is open, or that in the shape that they say
-    motions : empty where only a user can say which joint goes where
-    joints : which joint goes where, None where the motions are of the body's own joints
+    body : the open body, or that body in the shape of the motions
+    motions : empty if only a user can match the joints
+    joints : the joint matching, None if the motions are of the body's own joints
     """
 
     body: Body
@@ -66,7 +66,7 @@ def open_motions(body: Body, path: Path, job: Job) -> OpenedMotions:
 
     Raises
     ------
-    LCollisionError : the file can't be read, or is of no motion that the body can follow.
+    LCollisionError : the file can't be read, or the body can't follow its motion.
     """
     from lcollision_core.bodies.motions import body_of_motion as in_shape
     from lcollision_core.bodies.motions import is_carried

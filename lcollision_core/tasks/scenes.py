@@ -30,11 +30,11 @@ _ONLY_CLIP_RATE = 30.0
 
 
 def open_scene(source: str, options: SceneOptions) -> Body:
-    """Open a body, and the scene that it is in; a scene's file too.
+    """Open a body, with the scene around it if any; or a scene file.
 
     Raises
     ------
-    LCollisionError : a file cannot be read, or an option names what is not there.
+    LCollisionError : a file cannot be read, or an option names an unknown body.
     """
     from lcollision_core.bodies import open_body
     from lcollision_core.bodies.scene_file import body_of_scene
@@ -49,7 +49,7 @@ def open_scene(source: str, options: SceneOptions) -> Body:
 
 
 def is_scene_file(source: str | Path) -> bool:
-    """Whether a file is that of a scene: see `bodies.scene_file`."""
+    """Whether a file is a scene file: see `bodies.scene_file`."""
     if Path(source).suffix.lower() != POSES_SUFFIX:
         return False
     from lcollision_core.bodies import scene_file
@@ -58,11 +58,11 @@ def is_scene_file(source: str | Path) -> bool:
 
 
 def scene_of(source: str, options: SceneOptions) -> SceneFile:
-    """Return what the file of a scene would say of a body and what stands beside it.
+    """Return the scene of a body, or of a scene file, with the options applied.
 
     Raises
     ------
-    LCollisionError : an option is not as it should be, or names what is not there.
+    LCollisionError : an option is malformed, or names an unknown body.
     """
     from lcollision_core.bodies.names import unique_names
     from lcollision_core.bodies.scene_body import SceneFile, ScenePart
@@ -117,11 +117,11 @@ def _height(given: str | None, held: float | str | None) -> float | str | None:
 
 
 def beside_each_other(files: Sequence[Path]) -> SceneFile:
-    """Return the scene of some files that are opened together, each beside the one before.
+    """Return the scene of files opened together, each body beside the previous one.
 
     Raises
     ------
-    LCollisionError : a file is not there or cannot be read.
+    LCollisionError : a file is missing or cannot be read.
     """
     from lcollision_core.bodies.scene_body import SceneFile, ScenePart
     from lcollision_core.bodies.scene_file import beside
@@ -134,7 +134,7 @@ def beside_each_other(files: Sequence[Path]) -> SceneFile:
 
 
 def with_body(body: Body, body_file: str, path: Path) -> SceneFile:
-    """Return the scene of a body, or of one that is a scene, with a further body beside it.
+    """Return a body or a scene with another body beside it.
 
     Raises
     ------
@@ -152,13 +152,13 @@ def with_body(body: Body, body_file: str, path: Path) -> SceneFile:
 
 
 def with_ground(body: Body, body_file: str) -> str:
-    """Return the file in which the ground of a body or a scene counts, or no longer if it did.
+    """Toggle the ground of a body or a scene, and return the file of the result.
 
-    Codes of poses are the same there.
+    Codes of poses do not change.
 
     Raises
     ------
-    LCollisionError : it cannot be kept.
+    LCollisionError : the scene file cannot be written.
     """
     from lcollision_core.bodies import as_scene
     from lcollision_core.bodies.scene_body import SceneFile, ScenePart
@@ -173,11 +173,11 @@ def with_ground(body: Body, body_file: str) -> str:
 
 
 def kept_scene(scene: SceneFile) -> Path:
-    """Keep a scene that has no file of the user's in the data folder, and return where.
+    """Write a scene without a file of the user to the data folder, and return its path.
 
     Raises
     ------
-    MeshFileError : it cannot be kept.
+    MeshFileError : it cannot be written.
     """
     from platformdirs import user_data_path
 
@@ -193,7 +193,7 @@ def kept_scene(scene: SceneFile) -> Path:
 
 
 def parts_text(body: Body, pairs: npt.NDArray[np.integer]) -> list[str]:
-    """Return which parts collide, the most first, as in "hero: left hand - villain: chest"."""
+    """Return which parts collide, most pairs first, as in "hero: left hand - villain: chest"."""
     owner = body.space.vertex_domain[body.faces[pairs][:, :, 0]]
     domains, counts = np.unique(np.sort(owner, axis=1), axis=0, return_counts=True)
     names = body.domain_names
@@ -207,13 +207,13 @@ def parts_text(body: Body, pairs: npt.NDArray[np.integer]) -> list[str]:
 def given_of_scene(
     body: SceneBody, files: Sequence[Path], scale: float, job: Job = UNWATCHED
 ) -> list[GivenPose]:
-    """Read the poses of a scene, or of its bodies, each of the first of them that it fits.
+    """Read poses of a scene or of its bodies; each file is of the first body that it fits.
 
-    Without a file that is the scene as its bodies stand. What no file is of stays at rest.
+    Bodies without a file stay at rest; without files, the scene is at rest.
 
     Raises
     ------
-    LCollisionError : a file cannot be read, or is of no body of the scene.
+    LCollisionError : a file cannot be read, or fits no body of the scene.
     """
     from lcollision_core.bodies import NamedPose
     from lcollision_core.bodies.poses import OtherModelError, read_poses
@@ -268,7 +268,7 @@ def given_of_scene(
 
 
 def _encoded(member: SceneMember, path: Path, scale: float, job: Job) -> NamedPose:
-    """Return the pose that a mesh shows, with where it stands as codes of the whole body."""
+    """Return the pose of a mesh; its position becomes codes of the whole body."""
     from lcollision_core.bodies import NamedPose, name_of_file, read_model_mesh
 
     mesh = read_model_mesh(path, member.body)
@@ -283,14 +283,14 @@ def _encoded(member: SceneMember, path: Path, scale: float, job: Job) -> NamedPo
 
 @dataclass(frozen=True, eq=False)
 class PlayedMotion:
-    """What a body of a scene does.
+    """The motion of one body of a scene.
 
     Attributes
     ----------
     member : the body
-    motion : at the rate of the scene; None where it stands still
-    file : that it was read from
-    start : the frame of the scene in which it begins
+    motion : at the scene's frame rate; None if it stands still
+    file : source of the motion
+    start : frame of the scene at which it starts
     """
 
     member: SceneMember
@@ -299,7 +299,7 @@ class PlayedMotion:
     start: int
 
     def frames(self, n: int) -> npt.NDArray[np.intp]:
-        """Return which frame of the motion each of n frames of the scene shows; its ends hold."""
+        """Return the motion's frame in each of n frames of the scene, clamped to its ends."""
         last = 0 if self.motion is None else len(self.motion) - 1
         return np.clip(np.arange(n) - self.start, 0, last)
 
@@ -307,17 +307,17 @@ class PlayedMotion:
 def scene_motion(
     body: SceneBody, played: Sequence[str], choice: MotionChoice, job: Job = UNWATCHED
 ) -> tuple[Motion, list[PlayedMotion]]:
-    """Read the clips of the bodies of a scene, in time together.
+    """Read the clips of a scene's bodies as one motion.
 
     Parameters
     ----------
     played : see `SceneOptions`
-    choice : clips of this name, where bodies have one, and the frames a second; by default the most
-        that any of them has
+    choice : clip name, for bodies that have it, and frame rate; by default the highest of their
+        rates
 
     Raises
     ------
-    LCollisionError : an entry names no body, or a clip cannot be read; or nothing moves.
+    LCollisionError : an entry names an unknown body, a clip cannot be read, or nothing moves.
     """
     from lcollision_core.bodies.motions import read_motions
     from lcollision_core.motion import Motion
@@ -401,7 +401,7 @@ def _codes_of(
 def _asked_clips(
     body: SceneBody, played: Sequence[str], clip: str | None
 ) -> dict[str, tuple[Path, str | None, float]]:
-    """Return of each body that moves its file, its clip and when it begins, in seconds."""
+    """Return the file, clip and start time in seconds of each body that moves."""
     asked: dict[str, tuple[Path, str | None, float]] = {}
     for name, (own, start) in body.plays.items():
         member = body.member(name)
@@ -442,8 +442,8 @@ def write_member_motions(
 ) -> None:
     """Write a motion of a scene, each body to its own file of a folder.
 
-    A body that plays its own clip gets its file with that changed; else the motion is a new clip.
-    A prop gets a point cache. What is held goes with its holder, and gets one too.
+    A body that plays its own clip gets its file with the changed clip; for other characters the
+    motion is a new clip. Props get point caches, including held ones, which move with their holder.
 
     Raises
     ------
@@ -492,18 +492,18 @@ def write_member_motions(
 
 
 def playing(scene: SceneFile, number: int, clip: str, start: float) -> SceneFile:
-    """Return a scene in which a body plays one of its clips, and begins after some seconds."""
+    """Return a scene in which a body plays one of its clips from a start time in seconds."""
     parts = list(scene.bodies)
     parts[number] = replace(parts[number], clip=clip, start=start)
     return replace(scene, bodies=tuple(parts))
 
 
 def files_of_members(folder: Path, body: SceneBody, *, of_motion: bool) -> list[Path]:
-    """Return the files that an export of a scene writes, each body's own.
+    """Return the files that an export of a scene writes, one or two per body.
 
     Raises
     ------
-    LCollisionError : one of them is a file of the scene.
+    LCollisionError : one of them is a source file of the scene.
     """
     files = [folder / file for _, file in written_members(body)]
     if of_motion:
@@ -513,7 +513,7 @@ def files_of_members(folder: Path, body: SceneBody, *, of_motion: bool) -> list[
 
 
 def export_scene_pose(folder: Path, body: SceneBody, pose: NamedPose, job: Job) -> str:
-    """Write a pose of a scene, each body to its own file; return what the status bar is to say."""
+    """Write a pose of a scene, each body to its own file; return a sentence for the status bar."""
     from lcollision_core.tasks.members import write_members
 
     vertices = body.exported_vertices(pose.latent, pose.placement)
@@ -524,11 +524,11 @@ def export_scene_pose(folder: Path, body: SceneBody, pose: NamedPose, job: Job) 
 def export_scene_motion(
     folder: Path, body: SceneBody, before: Motion, after: Motion, job: Job
 ) -> str:
-    """Write a motion of a scene, as `export_scene_pose` does.
+    """Write a motion of a scene as `export_scene_pose` does.
 
     Parameters
     ----------
-    before : as it was read from the bodies' clips
+    before : the motion as read from the bodies' clips
     """
     played = scene_motion(body, (), MotionChoice(), job)[1]
     write_member_motions(folder, body, before, after, played, job)
@@ -543,13 +543,13 @@ def resolve_scene_motion(
     *,
     in_place: bool = False,
 ) -> ResolvedClip:
-    """Resolve what the bodies of a scene do together, and write each to its own file.
+    """Resolve the joint motion of a scene's bodies, and write each body to its own file.
 
     Raises
     ------
-    LCollisionError : a clip cannot be read, or the output cannot be written or is an input without
-        `in_place`.
-    CancelledError : the job was cancelled; what is done is kept beside the output.
+    LCollisionError : a clip cannot be read, the output cannot be written, or it is an input and
+        `in_place` is not set.
+    CancelledError : the job was cancelled; finished frames are kept beside the output.
     """
     from lcollision_core.tasks.resolving import resolve_one, run_of_motions, write_motions
 
