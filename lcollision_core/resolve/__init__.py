@@ -1,4 +1,4 @@
-"""The nearest collision-free pose: the paper's problem, then a ladder of exactly checked steps."""
+"""Find the nearest collision-free pose: a ladder of steps, each ended by the exact check."""
 
 from lcollision_core.options import Metric, ResolveOptions, Solver
 from lcollision_core.resolve.resolver import (

@@ -1,4 +1,4 @@
-"""The problem that a solver is given: nearest pose, no contact."""
+"""The optimisation problem of Resolve: the nearest pose without contact."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from lcollision_core.posing.exact import Contacts, nearest_within
 
 
 class CollisionModel(Protocol):
-    """What Resolve needs of a predictor; it must be smooth in the latent pose."""
+    """The interface that Resolve needs of a predictor, smooth in the latent pose."""
 
     def logit_and_gradient(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
-        """(B, D) poses to (B,) collision logits and their (B, D) gradients."""
+        """Return (B,) collision logits of (B, D) poses, and their (B, D) gradients."""
 
 
 @dataclass
@@ -32,7 +32,7 @@ class Deadline:
     Attributes
     ----------
     budget : seconds, None for no limit
-    job : whose cancellation ends the solve
+    job : its cancellation ends the solve
     """
 
     budget: float | None = None
@@ -50,7 +50,7 @@ class Deadline:
         return self.budget is not None and self.seconds >= self.budget
 
     def poll(self) -> None:
-        """Raise `CancelledError` once the token is set."""
+        """Raise `CancelledError` if the job is cancelled."""
         self.job.check()
 
 
@@ -66,17 +66,17 @@ class ResolveProblem:
     target : (D,) float64 array Z*
     metric : (D, D) float64 array G of d(Z, Z') = (Z - Z')^T G (Z - Z')
     code_weights : (D,) float64 array > 0, of the solvers' own distance
-    low, high : (D,) float64 arrays; equal where a code is locked
+    low, high : (D,) float64 arrays; equal for a locked code
     limit : the threshold's logit
-    model : of the constraint; None without a predictor, and then there is none but the exact check
+    model : of the constraint; None without a predictor, where only the exact check constrains
     deadline : polled before each evaluation
-    evaluations : poses evaluated so far
+    evaluations : number of poses evaluated so far
 
     Notes
     -----
-    The solvers keep the plain distance of the codes small, times the user's weights, whatever
-    `metric` is: where moves that hardly displace a vertex are cheap, they find poses that the model
-    wrongly calls free. What they find is then pulled back in `metric` against the exact check.
+    Whatever `metric` is, the solvers minimise the plain distance of the codes, times the user's
+    weights: if moves that hardly displace a vertex are cheap, they find poses that the model
+    wrongly calls free. Their results are then pulled back in `metric` against the exact check.
     """
 
     target: FloatArray
@@ -91,33 +91,33 @@ class ResolveProblem:
 
     @property
     def movable(self) -> npt.NDArray[np.bool_]:
-        """(D,) which codes are not locked."""
+        """(D,) whether each code is not locked."""
         free: npt.NDArray[np.bool_] = self.high > self.low
         return free
 
     def distance(self, latent: FloatArray) -> FloatArray:
-        """Measure d of (..., D) poses from Z*: (...)."""
+        """Return the (...) distances d of (..., D) poses from Z*."""
         moved = latent - self.target
         squared: FloatArray = np.einsum("...i,ij,...j->...", moved, self.metric, moved)
         return squared
 
     def search_distance(self, latent: FloatArray) -> FloatArray:
-        """Measure the solvers' squared distance of (..., D) poses from Z*: (...)."""
+        """Return the solvers' (...) squared distances of (..., D) poses from Z*."""
         squared: FloatArray = (latent - self.target) ** 2 @ self.code_weights
         return squared
 
     def nearest(self, centre: FloatArray, contacts: Contacts) -> FloatArray | None:
-        """Return the pose nearest to a (D,) pose in all half-spaces, None if there is none."""
+        """Return the pose within all half-spaces nearest to a (D,) pose, None if there is none."""
         return nearest_within(
             self.metric, centre, self.low, self.high, contacts.normals, contacts.offsets
         )
 
     def excess(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Evaluate (B, D) poses: how far the logits are above the limit, (B,), and (B, D) slopes.
+        """Return how far the logits of (B, D) poses exceed the limit, (B,), and (B, D) slopes.
 
         Raises
         ------
-        CancelledError : the token was set.
+        CancelledError : the job was cancelled.
         RuntimeError : there is no predictor.
         """
         if self.model is None:
@@ -134,11 +134,11 @@ class SolverOutcome:
 
     Attributes
     ----------
-    latent : (D,) float64 array: of the poses that satisfy the constraint the nearest, else the
-        one that violates it least
-    status : the solver's own, in a word or two
-    converged : it ended by its tolerances
-    feasible : the constraint holds, margin included
+    latent : (D,) float64 array: the nearest pose that satisfies the constraint, else the pose that
+        violates it least
+    status : the solver's status, in a word or two
+    converged : whether it ended by its tolerances
+    feasible : whether the constraint holds, including the margin
     iterations : of the solver
     """
 
@@ -154,7 +154,7 @@ FEASIBLE = 1e-3
 
 
 def rank(distance: float, violation: float) -> tuple[float, float]:
-    """Order iterates: feasible ones by distance, before all others, those by violation."""
+    """Return a sort key of iterates: feasible ones by distance, then the others by violation."""
     return (0.0, distance) if violation <= FEASIBLE else (violation, distance)
 
 
@@ -165,9 +165,9 @@ _before = 1
 
 @contextmanager
 def single_torch_thread() -> Iterator[None]:
-    """Keep torch to the calling thread, and give it its threads back after the last solve.
+    """Restrict torch to the calling thread, and restore its threads after the last solve.
 
-    A predictor's gradients of a few poses take a millisecond; on a busy machine threads that
+    A predictor's gradients of a few poses take a millisecond; on a busy machine, threads that
     shared them would wait for each other up to fifty times as long.
     """
     global _inside, _before
@@ -179,7 +179,7 @@ def single_torch_thread() -> Iterator[None]:
         if _inside == 0:
             _before = torch.get_num_threads()
         _inside += 1
-        # In each calling thread: torch keeps the number thread by thread.
+        # In each calling thread: torch's setting is per thread.
         torch.set_num_threads(1)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Resolve a pose: the ladder of solvers, from free poses, with what came of it."""
+"""Resolve a pose by a ladder of solvers and of steps from free poses; report the result."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from lcollision_core.resolve.steps import LeastOverlap, Standing, fall_back, pul
 class Step(StrEnum):
     """The step of the ladder that a result comes from.
 
-    After each the pose is pulled back towards the target: see `pull_back`.
+    After each step the pose is pulled back towards the target: see `pull_back`.
     """
 
     UNCHANGED = "unchanged"
@@ -56,40 +56,40 @@ class Step(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class ResolveResult:
-    """Where Resolve ended. Lengths are normalised, energies in squared normalised length.
+    """The result of Resolve. Lengths are normalised, energies in squared normalised length.
 
-    Three facts are kept separately: that the solver converged, that the predictor calls the pose
-    free, and that it is free by the exact check.
+    Three facts are kept separately: whether the solver converged, whether the predictor calls the
+    pose free, and whether it is free by the exact check.
 
     Attributes
     ----------
     latent : (D,) float64 array, read-only
-    vertices : (V, 3) array, read-only, in the data's unit: what the exact check saw, and what is to
-        be written; float32 in the model's coordinates, or float64 where the pose is placed
+    vertices : (V, 3) array, read-only, in the data's unit, as checked and to be written; float32 in
+        the model's coordinates, or float64 if the pose is placed
     solver_status : the status of the solver of the paper's problem at its least margin, "not run"
-        where none ran, "no predictor" where the steps did without
-    converged : that it ended by its own tolerances
-    predicted_free : the collision probability of `latent` is at most the threshold; None of a body
-        without a predictor
-    exactly_free : by the exact check of the vertices rounded to float32, with the clearance; None
+        if none ran, "no predictor" if there is none
+    converged : whether that solver ended by its own tolerances
+    predicted_free : whether the collision probability of `latent` is at most the threshold; None
+        for a body without a predictor
+    exactly_free : verdict of the exact check on the exported vertices, with the clearance; None
         without `verify`
-    step : of the ladder, the one that resolved the collisions
+    step : the step of the ladder that resolved the collisions
     energy_before, energy_after : exact penetration energy; None without `verify`. With a clearance,
-        depths are what pairs lack.
+        depths are the distances that pairs lack.
     pairs_before, pairs_after : exact number of colliding pairs; None without `verify`
-    latent_distance : ||Z - Z*|| / ||Z*||, or ||Z - Z*|| where Z* is the zero pose; 0 for a pose
-        that did not move
+    latent_distance : ||Z - Z*|| / ||Z*||, or ||Z - Z*|| if Z* is the zero pose; 0 for a pose that
+        did not move
     vertex_distance_mean, vertex_distance_max : from the decoded target
-    iterations : of the solver at its least margin, for those of NLopt its evaluations; further
-        margins and restarts do not count
-    evaluations : poses for which the predictor was evaluated
-    seconds : spent
-    note : a sentence for the user, None if there is nothing to say
-    clearance : that was asked for, normalised
-    largest_change : of a vertex that was asked for, normalised; None if any was allowed
-    deepest_after : the largest depth of a colliding pair, 0 of a free pose; None without `verify`
-    least_distance : where a clearance was asked for, the least signed distance between parts; None
-        where it is at least both `DISTANCE_BOUND` and the clearance
+    iterations : of the solver at its least margin, for NLopt its evaluations; larger margins and
+        restarts do not count
+    evaluations : number of poses for which the predictor was evaluated
+    seconds : time spent
+    note : a sentence for the user, or None
+    clearance : the requested clearance, normalised
+    largest_change : the requested largest change of a vertex, normalised; None for no limit
+    deepest_after : the largest depth of a colliding pair, 0 for a free pose; None without `verify`
+    least_distance : with a clearance, the least signed distance between parts; None if it is at
+        least both `DISTANCE_BOUND` and the clearance
     """
 
     latent: npt.NDArray[np.float64]
@@ -117,11 +117,11 @@ class ResolveResult:
 
 
 MARGINS = (0.0, 2.0, 8.0)
-"""In the logit, above the user's own. Those that no pose reaches still lead the right way."""
+"""Margins in the logit, added to the user's. Those that no pose reaches still give a direction."""
 
 ITERATIONS = (1, 3, 2, 4, 6, 14)
-"""After each of these the poses are checked exactly, and the first that is free ends the search:
-pulling back then brings it nearer to the target than further iterations do."""
+"""Numbers of iterations after which the poses are checked exactly. The first free pose ends the
+search: pulling back then brings it nearer to the target than more iterations would."""
 
 START_MARGIN, START_ITERATIONS = 6.0, 15
 _KNOWN_STARTS, _RANDOM_STARTS = 4, 4
@@ -131,11 +131,11 @@ _REMEMBERED, _POLISHED = 8, 3
 _ITERATIONS_ALONE = 60
 
 _FAR = 0.02
-"""Mean displacement of a free pose, normalised, from which on a nearer one is looked for."""
+"""Normalised mean displacement of a free pose beyond which a nearer one is looked for."""
 
 ALL_LOCKED = "all body parts are locked, so the pose was not changed; unlock one"
+"""The note of a result whose pose has no movable code."""
 FEET_MOVED = "the feet moved, as keeping them on the ground moves the body too far"
-"""The note of a result whose pose had no code that may move."""
 
 _Tried = tuple[Step, FloatArray | None]
 """A step, and the free pose that it found or None."""
@@ -148,12 +148,12 @@ class Ladder:
     Attributes
     ----------
     problem, check, options : of the pose
-    known_free : makes `free_latents`, (F, D) float64 array of poses known to be free
+    known_free : computes `free_latents`, (F, D) float64 array of poses known to be free
     correction : (D,) float64 array to try first, or None
-    job : reports (steps done, all steps), the last step being to pull back
+    job : reports (steps done, all steps); the last step is pulling back
     pushes_first : whether steps out of contact come before those from known free poses
-    remark : on the request, whatever its result, or None
-    standing : what is to stay on the ground, or None
+    remark : note on the request, whatever the result, or None
+    standing : the parts that should stay on the ground, or None
     """
 
     problem: ResolveProblem
@@ -175,7 +175,7 @@ class Ladder:
 
     @cached_property
     def free_latents(self) -> FloatArray:
-        """(F, D) poses known to be free, which may take long to find."""
+        """(F, D) poses known to be free; finding them may take long."""
         return self.known_free()
 
     @cached_property
@@ -184,9 +184,9 @@ class Ladder:
         return LeastOverlap(self.check, self.problem, self.options.largest_change)
 
     def _push_out(self, known: FloatArray | None = None) -> FloatArray | None:
-        """Return the pose that steps out of contact end in, once, if it is nearer than a known one.
+        """Return the pose reached by steps out of contact if it is nearer than a known one.
 
-        A body that has a predictor is led by that.
+        This runs at most once, and only without a predictor.
         """
         if self._has_pushed or self.problem.model is not None or not self.options.largest_change:
             return None
@@ -223,14 +223,14 @@ class Ladder:
         return result
 
     def _put_back(self, free: FloatArray) -> FloatArray:
-        """Return a free pose with what stood in the target on the ground."""
+        """Return a free pose with the target's standing parts put back on the ground."""
         if self.standing is None:
             return free
         self._nearer = free
         return self.standing.put_back(self.check, self.problem, free)
 
     def _lifted(self, latent: FloatArray, least: LeastOverlap) -> tuple[FloatArray, str | None]:
-        """Return a pose moved up until nothing is below the ground, if near, and else a note."""
+        """Return a pose lifted above the ground; if that exceeds the bound, the pose and a note."""
         if self.standing is None:
             return latent, None
         lifted = self.standing.lifted(self.check, self.problem, latent)
@@ -241,8 +241,8 @@ class Ladder:
     ) -> tuple[FloatArray, Step, str | None]:
         """Return a free pose that moves no vertex too far, else the one of least overlap.
 
-        A free pose that moves too far for what stands to stay is taken without that, and a note
-        says so. Where no pose was found free, however far, the note of that stays.
+        If keeping the feet on the ground moves a free pose too far, return it without that, with a
+        note. If no free pose was found at any distance, its note stays.
         """
         least = self._least
         if found is None or least.mean_change(found) > _FAR:
@@ -266,7 +266,7 @@ class Ladder:
         return latent, Step.NONE if is_same else Step.SOFT, note
 
     def solve_only(self) -> ResolveResult:
-        """Solve the paper's problem and check nothing exactly."""
+        """Solve the paper's problem without the exact check."""
         problem = self.problem
         if not problem.movable.any():
             excess, _ = problem.excess(problem.target[None])
@@ -287,7 +287,7 @@ class Ladder:
             n_tries = len(ITERATIONS) + 1
         else:
             n_tries = len(MARGINS) + min(len(self.free_latents), _KNOWN_STARTS) + _RANDOM_STARTS
-        # The neighbour's correction, the tries, polishing, falling back and pulling back.
+        # The neighbour's correction, the tries, polishing, falling back, and pulling back.
         return int(self.correction is not None) + n_tries + _POLISHED + 2
 
     def _steps(self) -> Iterator[_Tried]:
@@ -326,7 +326,7 @@ class Ladder:
             yield Step.SOLVER if is_first else Step.MARGIN, latent
 
     def _by_restarts(self) -> Iterator[_Tried]:
-        """Start between Z* and known free poses, and at random poses near Z*."""
+        """Restart halfway between Z* and known free poses, and at random poses near Z*."""
         problem = self.problem
         known = np.where(problem.movable, self.free_latents, problem.target)
         order = np.argsort(problem.search_distance(known), kind="stable")[:_KNOWN_STARTS]
@@ -350,7 +350,7 @@ class Ladder:
         yield Step.TOWARDS, step_towards(self.check, self.problem, self.free_latents)
 
     def _by_polish(self) -> Iterator[_Tried]:
-        """Polish the poses that the steps before left in the shallowest contact."""
+        """Polish the poses that earlier steps left in the shallowest contact."""
         poses = np.unique(np.stack([self.problem.target, *self._candidates]), axis=0)
         decoded = self.check.exported(self.check.decode(poses))
         energies = [self.check.find(vertices).energy for vertices in decoded]
@@ -366,7 +366,7 @@ class Ladder:
         return solve_nlopt(self.problem, Solver(self.options.solver), start, margin)
 
     def _first_free(self, latents: Sequence[FloatArray]) -> FloatArray | None:
-        """Return the nearest of some poses that is free; remember those that are not."""
+        """Return the nearest free pose of several; remember those that are nearer but collide."""
         for latent in sorted(latents, key=self.problem.distance):
             self.problem.deadline.poll()
             if self.check.is_free(latent):
@@ -428,23 +428,23 @@ class Ladder:
 
 
 def relative_distance(latent: FloatArray, target: FloatArray) -> float:
-    """Measure ||Z - Z*|| / ||Z*|| of two (D,) poses, or ||Z - Z*|| where Z* is the zero pose."""
+    """Return ||Z - Z*|| / ||Z*|| of two (D,) poses, or ||Z - Z*|| if Z* is the zero pose."""
     return float(np.linalg.norm(latent - target)) / (float(np.linalg.norm(target)) or 1.0)
 
 
 STILL_WEIGHT = 1e4
-"""Of the squared displacement of parts that are to stay where they are: feet then slide by less
-than a thousandth of a percent a frame. Locking their codes instead leaves poses colliding."""
+"""Weight of the squared displacement of parts that should stay: feet then slide by less than a
+thousandth of a percent per frame. Locking their codes instead leaves poses colliding."""
 
 
 class PoseResolver:
-    """Resolves the self-collisions of one model's poses; immutable, safe between threads.
+    """Resolve the self-collisions of one model's poses; immutable, safe between threads.
 
     Parameters
     ----------
     check : the exact check of the model's poses
-    predictor : the differentiable predictor: a `CollisionPredictor`; None leaves out the steps that
-        need one, and steps from known free poses towards the target instead
+    predictor : a differentiable `CollisionPredictor`; with None, steps from known free poses
+        towards the target replace those that need one
     free_latents : (F, D) array of poses known to be collision-free: see `find_free_poses`. Without
         any, a pose that the other steps do not resolve stays colliding.
 
@@ -467,13 +467,13 @@ class PoseResolver:
         self._free_latents: FloatArray = np.array(free_latents, np.float64).reshape(-1, size)
 
     def with_check(self, check: ExactCheck) -> PoseResolver:
-        """Return the same of poses that another check judges, as where something is added to them.
+        """Return the resolver with another check, as for poses that something is added to.
 
         Parameters
         ----------
         check : of the same space
         """
-        # Known poses that collide by it are left out where they are used.
+        # Known poses that collide by the check are left out where they are used.
         other = copy(self)
         other.check, other._space = check, check.space
         return other
@@ -494,15 +494,15 @@ class PoseResolver:
         latent : (D,) finite array Z*
         options : the defaults if None
         job : reports (steps of the ladder done, all steps); polled at every evaluation
-        placement : where the pose is exported to; the exact check is of the vertices there
+        placement : applied to the pose for export; the exact check is of the placed vertices
         near : (D,) array, a correction Z - Z* to try first, as of the neighbouring frame
-        before : (D,) array, a collision-free pose that is known besides, as of the neighbouring
-            frame; without a predictor the way to Z* may begin there
+        before : (D,) array, a further known collision-free pose, as of the neighbouring frame;
+            without a predictor, the search may start from it
 
         Returns
         -------
-        result : ResolveResult; a collision-free pose comes back unchanged, and what cannot be done
-            (all domains locked, no free pose known) is said in its note
+        result : ResolveResult; a collision-free pose is returned unchanged, and a note says why a
+            pose cannot be resolved (all domains locked, no free pose known)
 
         Raises
         ------
@@ -519,7 +519,7 @@ class PoseResolver:
             )
         target = self._checked(latent)
         outside = int(np.count_nonzero((target < self._low) | (target > self._high)))
-        # Nobody has trained a bare rig, nor has it sliders where a client poses it.
+        # A bare rig has no trained range, and no sliders where a client poses it.
         what, kind = ("values of the pose", "their usual range")
         if self._predictor is not None:
             what, kind = ("sliders", "the trained range")
@@ -530,7 +530,7 @@ class PoseResolver:
         if chosen.standing is not None:
             standing = Standing.of(self.check, target, np.array(chosen.standing))
             if not self._space.limbs.is_relative:
-                # Nothing else keeps them there.
+                # Nothing else keeps the standing parts in place.
                 still = chosen.still_domains | standing.domains(self.check)
                 chosen = replace(chosen, still_domains=still)
 
@@ -553,7 +553,7 @@ class PoseResolver:
             return ladder.climb() if chosen.verify else ladder.solve_only()
 
     def _known_free(self, target: FloatArray) -> FloatArray:  # noqa: ARG002
-        """Return (F, D) poses that are known to be free, for a (D,) target."""
+        """Return (F, D) poses known to be free, for a (D,) target."""
         return self._free_latents
 
     def resolve_many(
@@ -577,25 +577,25 @@ class PoseResolver:
         workers : threads, one for each available core by default; results do not depend on it
         job : reports (poses done, B), from one thread at a time; polled at every evaluation, and
             before each frame of a sequence is checked
-        placements : where each pose is exported to
-        sequence : the poses are the frames of a motion: a frame starts from the correction of the
-            one before, so that the motion does not flicker. Frames that collide in a row are one
-            thread's work.
+        placements : of each pose for export
+        sequence : whether the poses are frames of a motion: a frame then starts from the correction
+            of the one before, so that the motion does not flicker. One thread resolves successive
+            colliding frames.
         done : results of an earlier run by index, which are not computed again
-        keep : called with each further result and its index as soon as it is there, from one
-            thread at a time: what was done is known whatever interrupts the rest
+        keep : called with the index and the result of each new pose at once, from one thread at a
+            time, so that an interruption loses nothing
 
         Returns
         -------
-        results : B of them, in the order of `latents`
+        results : B results, in the order of `latents`
 
         Raises
         ------
-        ShapeError, LCollisionError, CancelledError : as of `resolve`.
+        ShapeError, LCollisionError, CancelledError : as for `resolve`.
         """
         rows = [self._checked(row) for row in np.atleast_2d(np.asarray(latents, np.float64))]
         placed = [None] * len(rows) if placements is None else placements
-        # Built once, before several threads would each begin to.
+        # Build the cached parts before threads use them.
         _ = self._space.metric, self._space.decode(np.zeros((1, len(self._low))))
         known = done or {}
         results: dict[int, ResolveResult] = {}
@@ -643,16 +643,16 @@ class PoseResolver:
     def problem(
         self, target: FloatArray, options: ResolveOptions, job: Job = UNWATCHED
     ) -> ResolveProblem:
-        """Return the problem of one pose: what a distance is, and where its codes may lie.
+        """Return the problem of one pose: its metric and the bounds of its codes.
 
         Parameters
         ----------
         target : (D,) finite float64 array Z*
-        options, job : as of `resolve`
+        options, job : as for `resolve`
 
         Raises
         ------
-        ShapeError, LCollisionError : as of `resolve`.
+        ShapeError, LCollisionError : as for `resolve`.
         """
         is_displacement = options.metric == Metric.DISPLACEMENT
         metric = self._space.metric if is_displacement else np.eye(len(target))
@@ -702,7 +702,7 @@ def _is_colliding(
 
 MOST_POSES = 200
 ENOUGH_POSES = 16
-"""With fewer of the training poses free, samples of the box are searched for more."""
+"""Number of free training poses below which samples of the box are searched for more."""
 
 SEARCHED_BLOCKS = 64
 _SHRINKINGS = (0.75, 0.5, 0.25)
@@ -720,9 +720,9 @@ def find_free_poses(embedding: Embedding, check: ExactCheck) -> FloatArray:
     Returns
     -------
     free_latents : (F, D) float64 array, F at most `MOST_POSES`; the mean pose first if it is free.
-        Where fewer than `ENOUGH_POSES` of these are free, training poses drawn towards the mean
-        and up to 2048 samples of the latent box are searched too, so that F = 0 says that none of
-        some thousand poses is free.
+        If fewer than `ENOUGH_POSES` are free, training poses moved towards the mean and up to 2048
+        samples of the latent box are searched too, so that F = 0 means that none of about two
+        thousand poses is free.
     """
     training = embedding.training_latent.astype(np.float64)
     chosen = evenly_spaced(len(training), MOST_POSES - 1)
@@ -751,14 +751,13 @@ def largest_correction_change(
     Parameters
     ----------
     decode : from (B, D) latent poses to (B, V, 3) vertices, normalised
-    latents : (B, D) array, the frames as they were
-    results : of them, in order
+    latents : (B, D) array, the frames before Resolve
+    results : of the frames, in order
 
     Returns
     -------
-    change : the largest of all frames of the mean distance over vertices, in normalised length,
-        between the displacement of a frame by its correction and that of the frame before; 0 for
-        one frame
+    change : the largest change of the correction from one frame to the next: the mean distance over
+        vertices, in normalised length, between the two displacements; 0 for one frame
     """
     displacements = (
         np.subtract(*decode(np.stack([result.latent, latent])))

@@ -1,7 +1,7 @@
 """Solvers of a problem: sequential quadratic programming, and those of NLopt.
 
 With one linearised constraint the quadratic program has nearly a closed form, so an iteration
-costs little more than the model's gradients, and those of several problems come as one batch.
+costs little more than the model's gradients, which are evaluated in batches.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lcollision_core.resolve.problem import FEASIBLE, ResolveProblem, SolverOutc
 
 _SETTLED = 0.02
 """A row has converged when its step is this fraction of its distance from Z*; the exact check and
-pulling back follow, so more digits would be lost."""
+pulling back follow, so more digits would be wasted."""
 
 _PATIENCE = 20
 _SHORTEST = 0.1
@@ -40,18 +40,18 @@ class SqpBatch:
 
     Parameters
     ----------
-    problem : what the rows share
-    starts : (B, D) float64 array, put within the bounds
+    problem : shared by the rows
+    starts : (B, D) float64 array, clipped to the bounds
     margins : (B,) float64 array >= 0
 
     Raises
     ------
-    CancelledError : the problem's token was set.
+    CancelledError : the job was cancelled.
     """
 
     def __init__(self, problem: ResolveProblem, starts: FloatArray, margins: FloatArray) -> None:
         n_rows = len(starts)
-        # What holds to the tolerance then holds exactly.
+        # A constraint that holds within the tolerance then holds exactly.
         self._problem, self._margins = problem, margins + FEASIBLE
         self._here = np.clip(starts, problem.low, problem.high)
         # Rows that start at one pose share its evaluation.
@@ -73,11 +73,11 @@ class SqpBatch:
         ]
 
     def run(self, n_iterations: int) -> list[SolverOutcome]:
-        """Run at most so many further iterations; the outcomes are in the order of the rows.
+        """Run at most `n_iterations` more iterations; return the outcome of each row, in order.
 
         Raises
         ------
-        CancelledError : the problem's token was set.
+        CancelledError : the job was cancelled.
         """
         for _ in range(n_iterations):
             for row in np.flatnonzero(self._running & self._fresh).tolist():
@@ -104,7 +104,7 @@ class SqpBatch:
         ]
 
     def _aim(self, row: int) -> None:
-        """Choose a row's next step, or find that it has converged."""
+        """Choose a row's next step, or stop it if it has converged."""
         problem, here = self._problem, self._here[row]
         violation = float(self._violation[row])
         slope = self._slope[row]
@@ -114,15 +114,15 @@ class SqpBatch:
         if settled and violation <= FEASIBLE:
             self._running[row] = False
         elif violation > FEASIBLE and (settled or self._iterations[row] >= _PATIENCE):
-            # Along a curved border steps reduce the violation by a few percent each, or swing
-            # about it; straight to it is nearly as near.
+            # Along a curved border, each step reduces the violation by a few percent, or steps
+            # oscillate; a direct step to the border ends nearly as near.
             goal, _ = _minimiser(problem, here, here, slope, violation)
         self._step[row] = goal - here
         self._length[row] = 1.0
         self._penalty[row] = max(self._penalty[row], _PENALTY * multiplier)
 
     def _judge(self, row: int, trial: FloatArray, violation: float, slope: FloatArray) -> None:
-        """Take a trial step, or halve it."""
+        """Accept a trial step, or halve it."""
         distance = float(self._problem.search_distance(trial))
         placed = rank(distance, violation)
         if placed < self._best_rank[row]:
@@ -147,7 +147,7 @@ def _minimiser(
 ) -> tuple[FloatArray, float]:
     """Find the pose nearest to a centre with slope . (Z - here) + violation <= 0 in the bounds.
 
-    Codes that would leave the bounds stop there, and the others make up for it. Also returns the
+    Codes that would leave the bounds stop there, and the others compensate. Also return the
     constraint's multiplier.
     """
     goal, multiplier = centre, 0.0
@@ -176,8 +176,8 @@ def polish(check: ExactCheck, problem: ResolveProblem, start: FloatArray) -> Flo
     """Leave shallow contact by a small move.
 
     Newton's method on the depths of the contacts: each round takes the smallest move that separates
-    all contacts seen so far. Depths of pairs of faces saturate where bodies are deep within each
-    other, and then give no direction: such poses fail.
+    all contacts found so far. Depths of pairs of faces saturate where bodies penetrate deeply, and
+    then give no direction: such poses fail.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def polish(check: ExactCheck, problem: ResolveProblem, start: FloatArray) -> Flo
 
     Raises
     ------
-    CancelledError : the problem's token was set.
+    CancelledError : the job was cancelled.
     """
     contacts = Contacts(check)
     latent = start
@@ -211,11 +211,11 @@ _INNER_TOLERANCE = 1e-3
 _INNER_EVALUATIONS = 40
 
 OBJECTIVE_OFFSET = 1.0
-"""Added to the objective, which is in units of ||Z*||^2: AUGLAG's first penalty is in proportion
-to the objective, and from Z* it would be its least one, with many rounds to grow."""
+"""Added to the objective, which is in units of ||Z*||^2: AUGLAG's first penalty is proportional to
+the objective, and from Z* it would be the least possible and take many rounds to grow."""
 
 _LEAST_SIZE = 1e-3
-"""Of the bounds' squared diagonal, the least unit of the objective: the zero pose has no length."""
+"""Least unit of the objective, as a share of the bounds' squared diagonal: Z* may be zero."""
 
 _STATUS = {
     nlopt.SUCCESS: "converged",
@@ -226,7 +226,7 @@ _STATUS = {
     nlopt.MAXTIME_REACHED: "out of time",
 }
 _FAILURES = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
-"""What NLopt raises on failure; from 2.10 no longer `RuntimeError`."""
+"""Exceptions that NLopt raises on failure; from 2.10 no longer `RuntimeError`."""
 
 _CONVERGED = {nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED}
 _ALGORITHMS = {
@@ -245,21 +245,21 @@ def solve_nlopt(
     ----------
     problem : the problem
     solver : `AUGLAG`, `SLSQP` or `CCSAQ`
-    start : (D,) float64 array, put within the bounds
+    start : (D,) float64 array, clipped to the bounds
     margin : >= 0
 
     Returns
     -------
-    outcome : the best iterate of all callbacks, however the solver ended, the start where there
+    outcome : the best iterate of all callbacks, however the solver ended, or the start if there
         was none; its iterations are NLopt's evaluations
 
     Raises
     ------
-    CancelledError : the problem's token was set, at the next evaluation.
+    CancelledError : the job was cancelled, at the next evaluation.
 
     Notes
     -----
-    The method of Tan et al. 2021 is AUGLAG, there by LOQO; here with LBFGS within, with
+    The method of Tan et al. 2021 is AUGLAG, there by LOQO; here with LBFGS as the inner solver and
     separate tolerances.
     """
     movable = np.flatnonzero(problem.movable)
@@ -282,11 +282,11 @@ def solve_nlopt(
         return OBJECTIVE_OFFSET + scale * float(weights @ moved**2)
 
     def evaluate(latent: FloatArray) -> tuple[float, FloatArray]:
-        """Evaluate the model, and keep the pose if it is the best so far."""
+        """Evaluate the model and keep the pose if it is the best so far."""
         nonlocal best, evaluated, halt
         evaluated = True
         excess, slope = problem.excess(latent[None])
-        # What holds to the tolerance then holds exactly.
+        # A constraint that holds within the tolerance then holds exactly.
         violation = float(excess[0]) + margin + FEASIBLE
         if not math.isfinite(violation):
             halt = "prediction not finite"
@@ -331,7 +331,7 @@ def solve_nlopt(
     except nlopt.ForcedStop:
         status = halt
     except _FAILURES:
-        # An inner failure ends the outer loop; the iterates that the callbacks kept stay valid.
+        # An inner failure ends the outer loop; the iterates kept by the callbacks stay valid.
         status = "halted by rounding"
     problem.deadline.poll()
     if not evaluated:  # out of time at the first evaluation

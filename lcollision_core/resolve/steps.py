@@ -1,4 +1,4 @@
-"""Steps from a pose: towards another, back from a collision, out of contact, feet on the ground."""
+"""Steps of Resolve: towards a pose, back from a collision, out of contact, feet on the ground."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ FIRST_HALVINGS, FURTHER_HALVINGS = 3, 5
 SLIDES = 5
 _SLIDE_HALVINGS = 1
 _SETTLED = 0.01
-"""Fraction of the distance that a further slide must gain."""
+"""Fraction of the distance that another slide must gain."""
 
 FALL_BACKS = 6
-"""Known free poses that are tried, the nearest ones: the segment to the nearest of all often is
-not the one that becomes free soonest."""
+"""Number of known free poses that are tried, the nearest ones: the segment to the nearest one is
+often not the one that becomes free first."""
 
 FALL_BACK_HALVINGS = 8
 
@@ -33,22 +33,22 @@ def bisect(
 ) -> tuple[FloatArray, FloatArray]:
     """Halve a segment `n` times between a free and a colliding pose.
 
-    Along a segment the free set need not be one interval: this finds a boundary of it, not always
-    the one that is nearest to the colliding end.
+    The free set on a segment may have several intervals: this finds one of its boundaries, not
+    always that nearest to the colliding end.
 
     Parameters
     ----------
     check, problem : of the pose
     free, colliding : (D,) float64 arrays
-    n : how often, >= 0
+    n : >= 0
 
     Returns
     -------
-    free, colliding : the ends of what is left
+    free, colliding : the ends of the remaining segment
 
     Raises
     ------
-    CancelledError : the problem's token was set.
+    CancelledError : the job was cancelled.
     """
     for _ in range(n):
         problem.deadline.poll()
@@ -61,11 +61,11 @@ def bisect(
 
 
 def pull_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> FloatArray:
-    """Move a free pose as near to Z* as it stays collision-free.
+    """Move a free pose towards Z* for as long as it stays collision-free.
 
-    First straight towards Z* by bisection. Where that is stopped, the contacts become linear
-    constraints, and the nearest pose that they allow is the next goal: the pose slides along what
-    it touches. Finally each domain that moved is put back alone, where that is free.
+    First move straight towards Z* by bisection. Where contact stops that, the contacts become
+    linear constraints, and the nearest pose that they allow is the next goal: the pose slides along
+    them. Finally each group of codes is put back alone, if the pose then stays free.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def pull_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> F
 
     Raises
     ------
-    CancelledError : the problem's token was set.
+    CancelledError : the job was cancelled.
     """
     free, colliding = bisect(check, problem, free, problem.target, FIRST_HALVINGS)
     slid = _slide(check, problem, free, colliding)
@@ -90,9 +90,9 @@ def pull_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> F
 def fall_back(
     check: ExactCheck, problem: ResolveProblem, free_latents: FloatArray
 ) -> FloatArray | None:
-    """Bisect the segments from Z* to known free poses, and take the end that is nearest to Z*.
+    """Bisect the segments from Z* to known free poses, and return the end nearest to Z*.
 
-    Locked codes stay, so that a known free pose may collide without them; those are left out.
+    Known poses that collide with the locked codes of Z* are left out.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def fall_back(
 
     Raises
     ------
-    CancelledError : the problem's token was set.
+    CancelledError : the job was cancelled.
     """
     ends = np.where(problem.movable, free_latents, problem.target)
     reached: list[FloatArray] = []
@@ -141,7 +141,7 @@ def _slide(
 
 
 def _put_domains_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> FloatArray:
-    """Try for each group of codes, the farthest moved first, whether it may return to Z*."""
+    """Return each group of codes to Z* where the pose stays free, the largest gain first."""
 
     def put_back(codes: npt.NDArray[np.intp]) -> FloatArray:
         latent = free.copy()
@@ -153,7 +153,7 @@ def _put_domains_back(check: ExactCheck, problem: ResolveProblem, free: FloatArr
         problem.deadline.poll()
         if problem.deadline.expired:
             break
-        # Where the metric ties groups to each other, putting one back alone may add to it.
+        # If the metric couples groups, putting one back alone may increase the distance.
         tried = put_back(codes)
         gain = problem.distance(free) - problem.distance(tried)
         if gain > _SETTLED * problem.distance(free) and check.is_free(tried):
@@ -162,10 +162,10 @@ def _put_domains_back(check: ExactCheck, problem: ResolveProblem, free: FloatArr
 
 
 _WAYS = 4
-"""Poses that are headed for, in the order given."""
+"""Number of poses to head for, in the given order."""
 
 _STAGES = (0.5, 1.0)
-"""Shares of the largest change, each of which begins with what the one before found."""
+"""Shares of the largest change, as successive bounds; each starts from the previous result."""
 
 _ROUNDS, _HALVINGS = 12, 4
 _LEAST_GAIN = 0.01
@@ -173,29 +173,30 @@ _DAMPING = 1e-2
 """Share of the mean curvature that a step adds in all directions."""
 
 _GAP = 1e-4
-"""Normalised: how far past each other contacts are led, as what is less deep than the tolerance of
-the check is in contact yet."""
+"""Normalised gap to which contacts are moved apart, as depths below the check's tolerance are still
+contact."""
 
 _BOUNDED, _NEARLY = 8, 0.8
-"""Body parts whose farthest vertex a step bounds, from this share of the bound on."""
+"""Most body parts whose farthest vertex a step bounds, and the share of the bound from which it
+does."""
 
 _SHRINKS, _WITHIN = 10, 1.0 - 1e-4
 
 _OUT = ((0.0, 0.08), (0.0, 0.04), (0.0, 0.03), (0.0, 0.02))
-"""Where steps out of contact begin, as a share of the way to the nearest free pose that is known,
-and how far each moves the farthest vertex, normalised. Where some end in other contacts, longer or
-shorter ones may not."""
+"""Starts of steps out of contact, as a share of the path to the nearest known free pose, and the
+normalised displacement of the farthest vertex in a step. Where steps of one length end in other
+contacts, longer or shorter ones may not."""
 
 _BACK = ((0.75, 0.04), (0.5, 0.02), (0.75, 0.02), (0.25, 0.04))
 _PUSHES, _FARTHER = 40, 1.5
 _FACES, _LOOKS = 2_000_000, 24
-"""Faces of all poses that are looked at for a nearer one than is known, in about two seconds, and
-the fewest poses."""
+"""Budget of the search for a nearer free pose than the known one: faces of all checked poses, about
+two seconds, and least number of poses."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """A pose that was checked: (D,) codes, (V, 3) decoded vertices, and how it collides."""
+    """A checked pose: (D,) codes, (V, 3) decoded vertices and its collisions."""
 
     latent: FloatArray
     decoded: FloatArray
@@ -207,12 +208,12 @@ def _energy(seen: _Seen) -> float:
 
 
 class LeastOverlap:
-    """Finds poses of little overlap of which no vertex moves farther than a bound.
+    """Find poses of little overlap in which no vertex moves farther than a bound.
 
     Parameters
     ----------
     check, problem : of the pose
-    largest_change : > 0, of a vertex from its place in the decoded Z*, in normalised length
+    largest_change : > 0, of a vertex from its position in the decoded Z*, in normalised length
     """
 
     def __init__(self, check: ExactCheck, problem: ResolveProblem, largest_change: float) -> None:
@@ -225,10 +226,10 @@ class LeastOverlap:
         return float(self._lengths(self._check.decode(latent)[0]).max()) <= self._most
 
     def find(self, ends: Sequence[FloatArray]) -> FloatArray:
-        """Return the pose of least exact energy that is found within the bound.
+        """Return the pose of least exact energy found within the bound.
 
-        From Z* and from the best place on the ways to some poses, by Gauss-Newton steps on the
-        depths of the contacts, while the bound grows.
+        Start from Z* and from the best pose on the segments to `ends`, and take Gauss-Newton steps
+        on the depths of the contacts, while the bound grows.
 
         Parameters
         ----------
@@ -240,7 +241,7 @@ class LeastOverlap:
 
         Raises
         ------
-        CancelledError : the problem's token was set.
+        CancelledError : the job was cancelled.
         """
         best = self._start
         for share in _STAGES:
@@ -262,20 +263,20 @@ class LeastOverlap:
     def push_out(
         self, finish: Callable[[FloatArray], FloatArray], known: FloatArray | None
     ) -> FloatArray | None:
-        """Return the free pose nearest to Z* that steps out of its contacts end in, or None.
+        """Return the nearest free pose to Z* that steps out of contact reach, or None.
 
-        A step may add overlap, as where a limb has to pass through what it is in: steps that only
-        lose energy end before it. Once a free pose is known, the steps are bounded by the faces of
-        the poses that they check.
+        A step may add overlap, as when a limb has to pass through another part; steps that must
+        lose energy would end there. Once a free pose is known, the number of faces checked bounds
+        the steps.
 
         Parameters
         ----------
-        finish : from a free pose to the free pose that is compared, as with its feet put back
-        known : (D,) free pose; None is returned where no nearer one is found
+        finish : turns a free pose into the free pose to compare, as by putting its feet back
+        known : (D,) free pose; None is returned if no nearer one is found
 
         Raises
         ------
-        CancelledError : the problem's token was set.
+        CancelledError : the job was cancelled.
         """
         self._bound, problem = self._most, self._problem
         self._looks_left = max(_LOOKS, _FACES // self._check.space.topology.n_faces)
@@ -302,14 +303,14 @@ class LeastOverlap:
         return None if best is known else best
 
     def nearer(self, one: FloatArray | None, other: FloatArray | None) -> FloatArray | None:
-        """Return that of two (D,) poses which moves the vertices less; the first if alike."""
+        """Return which of two (D,) poses moves the vertices less, the first if they tie."""
         both = [pose for pose in (one, other) if pose is not None]
         return min(both, key=self.mean_change, default=None)
 
     def _pushed(self, here: _Seen, reach: float, known: FloatArray | None) -> FloatArray | None:
-        """Return the free pose that steps of a reach out of contact lead to, pulled back.
+        """Return the free pose that steps of length `reach` out of contact lead to, pulled back.
 
-        None where they end in contact, or lead much farther than to a known free pose.
+        None if they end in contact, or lead much farther than to a known free pose.
         """
         check, problem, best = self._check, self._problem, here
         most = np.inf if known is None else _FARTHER * self.mean_change(known)
@@ -337,8 +338,8 @@ class LeastOverlap:
         return _Seen(latent, decoded, self._check.find(self._check.exported(decoded)))
 
     def mean_change(self, latent: FloatArray) -> float:
-        """Return how far a (D,) pose moves the vertices on average, in normalised length."""
-        # The metric of codes is that of the rest pose.
+        """Return the mean vertex displacement of a (D,) pose, in normalised length."""
+        # Not by the metric of codes, which is that of the rest pose.
         return float(self._lengths(self._check.decode(latent)[0]).mean())
 
     def _lengths(self, decoded: FloatArray) -> FloatArray:
@@ -346,15 +347,15 @@ class LeastOverlap:
         return lengths
 
     def _within(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the pose towards a (D,) pose at which the bound is reached, and its vertices."""
+        """Return the last pose within the bound on the way to a (D,) pose, and its vertices."""
         return self._on_the_way(self._start, latent, self._bound)
 
     def _on_the_way(
         self, here: _Seen, goal: FloatArray, most: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the pose on the way to a goal at which a vertex has moved so far, or the goal.
+        """Return the pose on the way to a goal at which a vertex has moved by `most`, or the goal.
 
-        Its decoded vertices come with it.
+        Also return its decoded vertices.
         """
         share = 1.0
         for _ in range(_SHRINKS):
@@ -367,7 +368,7 @@ class LeastOverlap:
         return here.latent, here.decoded
 
     def _descend(self, here: _Seen) -> _Seen:
-        """Return the last pose of a descent that exceeds Z* in no way, or where it begins."""
+        """Return the last pose of a descent that does not exceed Z*, or else the start."""
         last = here
         for _ in range(_ROUNDS):
             if not here.found.colliding or self._problem.deadline.expired:
@@ -388,9 +389,9 @@ class LeastOverlap:
         return last
 
     def _goal(self, here: _Seen, gap: float = 0.0) -> FloatArray | None:
-        """Return the codes at which the contacts are least, or apart by a gap, to first order.
+        """Return the codes that minimise the contacts, or part them by a gap, to first order.
 
-        Each contact, of two body parts, is one residual: the root of its energy.
+        Each contact of two body parts is one residual: the root of its energy.
         """
         space, collisions, problem = self._check.space, here.found, self._problem
         regions = ContactRegions.of(space, collisions)
@@ -426,20 +427,20 @@ class LeastOverlap:
 
 
 _DRAGS, _MOST_STANDING_EVENTS = 6, 20
-"""Drags of one vertex each, and events of one."""
+"""Most drags, of one vertex each, and most events of a drag."""
 
 _NEAR = 0.002
-"""Normalised length: what is that near to its place is there."""
+"""Normalised distance up to which a vertex counts as back in its place."""
 
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """What stands on the ground in a pose.
+    """The parts of a pose that stand on the ground.
 
     Attributes
     ----------
     up : (3,) unit vector
-    points : (n,) int64 array, vertices that stand and are far apart, of each limb some
+    points : (n,) int64 array, standing vertices, a few of each limb, far apart
     decoded : (V, 3) float64 array, the pose's vertices in normalised length
     """
 
@@ -449,7 +450,7 @@ class Standing:
 
     @classmethod
     def of(cls, check: ExactCheck, latent: FloatArray, up: FloatArray) -> Standing:
-        """Find what stands in a (D,) pose: the ends of limbs at the height of the lowest point."""
+        """Find the standing parts of a (D,) pose: ends of limbs as low as its lowest point."""
         decoded, limbs = check.decode(latent)[0], check.space.limbs
         stands = limbs.standing(decoded, up, limbs.root).values()
         points = np.concatenate([*stands, np.empty(0)]).astype(np.int64)
@@ -465,24 +466,24 @@ class Standing:
         problem: ResolveProblem,
         free: FloatArray,
     ) -> FloatArray:
-        """Bring what stood back to the ground, and what sank below it.
+        """Bring standing parts back to the ground, and lift parts that sank below it.
 
-        The body is moved as a whole, then limbs are dragged; at last it is lifted by what is below
-        the ground yet.
+        The body is shifted as a whole, then limbs are dragged; finally the body is lifted until
+        nothing is below the ground.
 
         Parameters
         ----------
-        check, problem : of the pose that this is of; codes that the problem locks stay
+        check, problem : of the pose that this describes; codes that the problem locks stay
         free : (D,) float64 array, collision-free
 
         Returns
         -------
-        latent : (D,) float64 array, collision-free; the same where nothing stood, or the body has
-            no place of its own
+        latent : (D,) float64 array, collision-free; `free` if nothing stood, or if the codes hold
+            no position
 
         Raises
         ------
-        CancelledError : the problem's token was set.
+        CancelledError : the job was cancelled.
         """
         if not check.space.limbs.is_relative or not len(self.points):
             return free
@@ -506,7 +507,10 @@ class Standing:
         return _shifted(check, problem, latent, max(0.0, below) * self.up)
 
     def lifted(self, check: ExactCheck, problem: ResolveProblem, latent: FloatArray) -> FloatArray:
-        """Return a (D,) pose, free or not, moved up as a whole by what is below the ground."""
+        """Return a (D,) pose, free or not, lifted as a whole until nothing is below the ground.
+
+        A free pose that would then collide is returned unchanged.
+        """
         below = self._ground - float((check.decode(latent)[0] @ self.up).min())
         if not check.space.limbs.is_relative or not len(self.points) or below <= 0.0:
             return latent
@@ -518,9 +522,9 @@ class Standing:
         return float((self.decoded @ self.up).min())
 
     def _farthest(self, decoded: FloatArray) -> tuple[int, FloatArray]:
-        """Return the vertex that is farthest from where it is to be, and that place; -1 for none.
+        """Return the vertex farthest from its place, and that place; -1 if all are near theirs.
 
-        Of those that stood and of the lowest one, if that is below the ground.
+        Candidates are the standing vertices and the lowest one, whose place is on the ground.
         """
         heights = decoded @ self.up
         lowest = int(heights.argmin())
@@ -535,16 +539,16 @@ class Standing:
 def _shifted(
     check: ExactCheck, problem: ResolveProblem, free: FloatArray, way: FloatArray
 ) -> FloatArray:
-    """Move a free pose as a whole, unless rounding brings what touches into each other."""
+    """Shift a free pose as a whole, unless rounding makes touching parts collide."""
     moved = np.clip(check.space.shifted(free, way), problem.low, problem.high)
     return moved if check.is_free(moved) else free
 
 
 STARTS = 3
-"""Known free poses, the nearest ones, that the way begins at."""
+"""Number of known free poses, the nearest ones, to start from."""
 
 _MOST_DRAG_EVENTS = 60
-"""Of a drag, each of a few steps: far more than the way across the space takes."""
+"""Most events of a drag, each of a few steps: far more than it takes to cross the space."""
 
 
 def step_towards(
@@ -562,12 +566,12 @@ def step_towards(
 
     Returns
     -------
-    latent : (D,) float64 array, collision-free, the nearest to Z* that was reached, or None if all
-        known poses collide
+    latent : (D,) float64 array, the nearest collision-free pose to Z* that was reached, or None if
+        all known poses collide
 
     Raises
     ------
-    CancelledError : the problem's token was set.
+    CancelledError : the job was cancelled.
     """
     dragger = PoseDragger(check)
     locked = frozenset(np.flatnonzero(~problem.movable).tolist())
