@@ -101,7 +101,7 @@ class ModelCard:
     ----------
     height : the body size, in the data's unit
     up_axis : 0, 1 or 2 for x, y or z
-    domain_names : K different names
+    domain_names : K unique names
     domain_colours : K strings "#rrggbb"
     pose_names : N names of the training poses
     source : the data that the model was trained on
@@ -509,7 +509,7 @@ class Body(ABC):
         Returns
         -------
         vertices : (V, 3) or (B, V, 3) float64 array, in the body's unit, in its reference's
-            coordinates; identical to the bit for a pose alone and in any batch
+            coordinates; bit-identical for a pose alone and in any batch
 
         Raises
         ------
@@ -956,7 +956,7 @@ class Body(ABC):
 
     @property
     def domain_names(self) -> tuple[str, ...]:
-        """K different names."""
+        """K unique names."""
         return self.card.domain_names
 
     @property

@@ -76,7 +76,7 @@ def export_frame(
     scale: float | None = None,
     placement: RigidTransform | None = None,
 ) -> RigidTransform:
-    """Return the transform of right angles and scale into the axes and unit of a file.
+    """Return the rotation, by right angles, and scale into a file's axes and unit.
 
     Parameters
     ----------
@@ -434,7 +434,7 @@ class SourceFile:
 
         Raises
         ------
-        MeshFileError : the file cannot be written, or a pose is not one of the joints.
+        MeshFileError : the file cannot be written, or the joints cannot hold a pose.
         """
         if self._character is None or self._body.joints is None:
             raise MeshFileError.unwritable(path, "the poses are none of its joints", "choose .pc2")
@@ -579,6 +579,8 @@ def requested_form(
 ) -> ExportForm | None:
     """Return the form of an output; None for a plain mesh of the body.
 
+    Parameters
+    ----------
     path : of the output
     request : the form, and whether to keep clips
     source : the source file, by `source_for`

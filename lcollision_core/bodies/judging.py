@@ -92,7 +92,7 @@ def estimated_free(
 ) -> npt.NDArray[np.bool_]:
     """Return which frames of a motion are free by the estimate: (T,) bool.
 
-    None are if the body changes its shape between frames.
+    No frame counts as free if the body's own shape varies.
 
     Parameters
     ----------

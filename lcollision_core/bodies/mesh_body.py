@@ -149,12 +149,12 @@ class MeshBody(Body):
 
     @property
     def is_trained(self) -> bool:
-        """There is nothing to train."""
+        """False: there is nothing to train."""
         return False
 
     @property
     def can_resolve(self) -> bool:
-        """Nothing moves the mesh."""
+        """False: nothing moves the mesh."""
         return False
 
     @property

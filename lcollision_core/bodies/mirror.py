@@ -234,7 +234,7 @@ class MirrorSource:
     image: str
 
     def is_of(self, latent: npt.NDArray[Any], placement: RigidTransform | None) -> bool:
-        """Whether a pose is the mirrored pose, to the bit."""
+        """Whether a pose is the mirrored pose, bit for bit."""
         return self.image == fingerprint_of_pose(latent, placement)
 
 
@@ -247,7 +247,7 @@ class MirroredPose:
     latent : (D,) float64 array
     placement : where the decoded pose belongs, None for the model's own coordinates
     fit_error_mean, fit_error_max : distance of the decoded vertices from the exact mirror image
-    restored : whether this is the pose that the given one was mirrored from, to the bit
+    restored : whether this is the pose that the given one was mirrored from, bit for bit
     pairs_before : colliding pairs of faces of the given pose, by the exact check
     pairs_mirrored : of the pose nearest to the mirror image
     pairs_after : of this pose
@@ -289,7 +289,7 @@ def pose_bytes(latent: npt.NDArray[Any], placement: RigidTransform | None) -> by
 
 
 def fingerprint_of_pose(latent: npt.NDArray[Any], placement: RigidTransform | None) -> str:
-    """Return 16 hexadecimal digits that identify a pose and its placement, to the bit."""
+    """Return 16 hexadecimal digits that identify a pose and its placement exactly."""
     return hashlib.sha256(pose_bytes(latent, placement)).hexdigest()[:16]
 
 
@@ -330,7 +330,7 @@ class PoseMirror:
         latent : (D,) finite array
         placement : where the decoded pose belongs, None for the model's own coordinates
         source : what the pose was mirrored from, or None; if the pose is still that mirror image,
-            the source is returned, to the bit
+            the source itself is returned
         options : of the Resolve; its locked domains keep their mirrored codes
         job : reports (Resolve steps done, all steps); polled between the steps
 
@@ -378,7 +378,7 @@ class PoseMirror:
 
     def _misfit(
         self,
-        latent: FloatArray,  # noqa: ARG002 - the vertices tell
+        latent: FloatArray,  # noqa: ARG002 - used by `RigMirror`
         mirrored: FloatArray,  # noqa: ARG002
         off: FloatArray,
     ) -> FloatArray:
@@ -394,7 +394,7 @@ class PoseMirror:
 
     def _codes_of_image(
         self,
-        latent: FloatArray,  # noqa: ARG002 - bodies whose codes have sides need no fit
+        latent: FloatArray,  # noqa: ARG002 - used by `RigMirror`
         image: FloatArray,
         job: Job,
     ) -> FloatArray:
@@ -484,7 +484,7 @@ def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int)
                 share = float((distance < _NEAR * size).mean())
                 if share >= _MOST and (best is None or share > best[0]):
                     best = share, symmetry
-                # Parts on one side only had shifted the plane.
+                # Correct for parts on one side only, which had shifted the plane.
                 offset = np.median(0.5 * (across + across[nearest]))
     return None if best is None else best[1]
 
@@ -693,8 +693,8 @@ class RigMirror(PoseMirror):
     def _codes_of_image(
         self,
         latent: FloatArray,
-        image: FloatArray,  # noqa: ARG002 - the joints tell more than the vertices
-        job: Job,  # noqa: ARG002 - it is one step
+        image: FloatArray,  # noqa: ARG002 - joints are more reliable than vertices
+        job: Job,  # noqa: ARG002 - a single step
     ) -> FloatArray:
         flip, sides = self.symmetry.flip, self.sides
         moved = self.space.transforms(latent) @ np.linalg.inv(self.space.rig.rest)

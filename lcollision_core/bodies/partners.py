@@ -62,7 +62,7 @@ class JointMatch:
     ours : J names of the rig's joints
     called : J words for each joint's role, as "left elbow"; "" if unknown
     followed : the skeleton joint of each rig joint
-    unsure : rig joints whose match neither names nor positions determine
+    unsure : rig joints whose match is uncertain by both names and positions
     """
 
     theirs: tuple[str, ...]

@@ -78,7 +78,7 @@ class NamedPose:
     fit_error_mean, fit_error_max : of a pose fitted to a mesh or a mirror image, normalised
     tags : search terms in a library
     mirror_of : the pose that a mirror image was made from; mirroring the unchanged image again
-        returns it to the bit
+        returns it exactly
     pins : patches that stay in place while others are dragged
     moves : (D,) mask of the codes that it sets, such as those of hands; None for all. It is not
         stored in files.
@@ -99,7 +99,7 @@ class NamedPose:
         return self.latent if self.moves is None else np.where(self.moves, self.latent, latent)
 
     def same_as(self, other: NamedPose) -> bool:
-        """Whether latents, placements and pins are equal, to the bit; names may differ."""
+        """Whether latents, placements and pins are exactly equal; names may differ."""
         mine, others = (pose_bytes(pose.latent, pose.placement) for pose in (self, other))
         return mine == others and self.pins == other.pins
 
@@ -140,7 +140,7 @@ class PoseFile:
     def all_poses(self) -> tuple[NamedPose, ...]:
         """The poses, followed by the working one, renamed if its name is taken.
 
-        A working pose equal to one of `poses`, to the bit, is not repeated.
+        A working pose that is exactly equal to one of `poses` is not repeated.
         """
         working = self.working
         if working is None or any(pose.same_as(working) for pose in self.poses):
@@ -423,7 +423,7 @@ class _StoredPose(Struct, omit_defaults=True):
 
 
 def to_json(pose: NamedPose, model: Body) -> dict[str, Any]:
-    """Return the JSON record of a pose; poses that are equal to the bit have equal records."""
+    """Return the JSON record of a pose; exactly equal poses have equal records."""
     latent, shapes = _stored_latent(pose.latent, model)
     stored = _StoredPose(
         pose.name,
@@ -599,7 +599,7 @@ class PoseLibrary:
 
     @property
     def poses(self) -> tuple[NamedPose, ...]:
-        """The poses in their order, names all different."""
+        """The poses in order, with unique names."""
         return self._poses
 
     @property
@@ -783,7 +783,7 @@ def with_detail(
     vertices : (V, 3) float64 array, free by the exact check; None if the moved mesh would
         collide
     """
-    # If the pose did not move, the mesh is unchanged to the bit.
+    # If the pose did not move, the mesh is exactly unchanged.
     moved: npt.NDArray[np.float64] = mesh + (
         result.vertices - model.exported_vertices(pose.latent, pose.placement)
     )

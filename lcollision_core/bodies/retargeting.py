@@ -71,9 +71,9 @@ _MOST_ALIKE, _UPRIGHT = 0.8, 0.9
 class Retargeting:
     """A mapping of a skeleton's motion to a rig.
 
-    Each joint of the rig with a partner has its world rotation, relative to rest poses whose limbs
-    are aligned; other joints follow their parents. The hips' translation is scaled by the length of
-    the legs.
+    Each joint of the rig with a partner takes the partner's world rotation, relative to rest poses
+    whose limbs are aligned; other joints follow their parents. The hips' translation is scaled by
+    the length of the legs.
 
     Attributes
     ----------

@@ -212,7 +212,7 @@ folds: `ContactRules.near_by_limb`.
 """
 
 MOST_NEAR_PAIRS = 100_000_000
-"""Of vertices: 400 MB. The mannequin (14 442 vertices) has 7 million within 0.1."""
+"""Most near pairs of vertices: 400 MB. The mannequin (14 442 vertices) has 7 million within 0.1."""
 
 _MOST_TOUCHING = 50_000
 """Pairs at rest above which only these are excluded, without their surroundings."""
@@ -274,7 +274,7 @@ _BETWEEN = 0.8
 thighs meet within 0.78 when it steps, and cross from 1.3 on."""
 
 _SAME_PLACE = 1e-3
-"""Normalised length."""
+"""Normalised distance within which joints coincide."""
 
 
 def joint_groups(character: Character) -> tuple[FaceGroup, ...]:

@@ -664,12 +664,7 @@ class RigPoseSpace:
         return np.concatenate([moved[self._place], self._moved_by_shapes(chosen, motions[0])])
 
     def _moved_by_shapes(self, chosen: npt.NDArray[np.integer], linear: FloatArray) -> FloatArray:
-        """Return the derivatives of (n,) vertices by the shape codes: (S, n, 3).
-
-        Parameters
-        ----------
-        linear : of the bones
-        """
+        """Return derivatives of (n,) vertices by shape codes, for linear bone maps: (S, n, 3)."""
         if self.rig.shapes is None or not len(chosen):
             return np.zeros((self.n_shapes, len(chosen), 3))
         first, rows = self._rows_of(chosen)

@@ -268,7 +268,7 @@ class SceneBody(Body):
         return tuple(unique_names(names, MAX_NAME_LENGTH)), tuple(colours)
 
     def _joined_rules(self) -> tuple[ContactRules, tuple[FaceGroup, ...]]:
-        """Return the joint rules of all bodies; each body's rules apply within it."""
+        """Return the combined rules of all bodies; each body's rules apply within it."""
         groups: list[FaceGroup] = []
         ignored: list[tuple[str, str]] = []
         left_out: list[str] = []

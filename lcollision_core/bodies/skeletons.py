@@ -42,10 +42,10 @@ _FOUR_FINGER_JOINTS = 4
 """Number of joints from which a finger begins in the palm."""
 
 _MOST_JOINTS = 16
-"""Longest chain in which a limb's hinge is searched."""
+"""Longest chain in which a limb's hinge is searched for."""
 
 _MOST_PAIRS = 32
-"""Most pairs of branches in which legs and arms are searched."""
+"""Most pairs of branches in which legs and arms are searched for."""
 
 _LEAST_VOTE = 0.15
 """Least weight of the evidence for the direction that a body faces."""

@@ -57,7 +57,7 @@ def _ways() -> dict[str, tuple[str, tuple[float, float, float]]]:
 def axes_of_smpl(motion: SmplMotion) -> FloatArray:
     """Return the rotation from the motion's coordinates to the body's, in which y is up.
 
-    Up is the one of y and z along which the body mainly stands.
+    Up is y or z, whichever the body mainly stands along.
     """
     up = Rotation.from_rotvec(motion.turns[:, motion.names.index("pelvis")]).apply([0.0, 1.0, 0.0])
     _, y, z = up.mean(axis=0)

@@ -222,7 +222,7 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
 
     Raises
     ------
-    LCollisionError : the file cannot be read, has no clip, or needs no `rest`.
+    LCollisionError : the file cannot be read or has no clip, or its body needs no `rest`.
     CancelledError : the job was cancelled.
     """
     from lcollision_core.bodies import open_body

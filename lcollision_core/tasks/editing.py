@@ -39,7 +39,7 @@ def resolve_pose(
     Returns
     -------
     result : its seconds are of the search, without compilation on first use
-    before : (V, 3) float32 array, read-only: the mesh before, to the bit as it was drawn
+    before : (V, 3) float32 array, read-only: the mesh before, exactly as drawn
     """
     from lcollision_core.compiled import seconds_compiling
 
@@ -88,7 +88,7 @@ def free_neighbours(
 ) -> Motion | None:
     """Resolve frames that collide after an edit of one frame was eased in; None if none do.
 
-    Free frames stay equal to the bit, including the edited one if free.
+    Free frames stay bit-identical, including the edited one if free.
 
     Parameters
     ----------

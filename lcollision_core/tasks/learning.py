@@ -524,8 +524,8 @@ def learn_predictor(
 
     Parameters
     ----------
-    body : without a predictor, or with another
     body : its predictor, if any, is not used
+    rows, config, store, checkpoint, seed, device, job : see `train_predictor`
 
     Raises
     ------

@@ -543,7 +543,7 @@ def resolve_scene_motion(
     *,
     in_place: bool = False,
 ) -> ResolvedClip:
-    """Resolve the joint motion of a scene's bodies, and write each body to its own file.
+    """Resolve the combined motion of a scene's bodies, and write each body to its own file.
 
     Raises
     ------

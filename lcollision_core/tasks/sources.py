@@ -202,7 +202,7 @@ def _detector(poses: PoseSet) -> CollisionDetector:
 
 
 def _near_exclusion(poses: PoseSet, chosen: npt.NDArray[np.intp], job: Job) -> float:
-    """Return the shortest near exclusion with which few poses collide, if few enough pairs."""
+    """Return the shortest near exclusion with which few poses collide, within the pair limit."""
     shares: dict[float, float] = {}
     rest = poses.vertices[0].astype(np.float64)
     size = body_size(rest, poses.topology)
