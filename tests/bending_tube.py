@@ -1,4 +1,4 @@
-"""A closed tube that bends at two joints: a body whose every pose is known."""
+"""A closed tube that bends at two joints: a body with analytic poses."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def tube_topology() -> Topology:
 
 
 def bent_tube(lower: float, upper: float) -> npt.NDArray[np.float64]:
-    """Bend a tube of length 1 along y about z by two angles in radians; (V, 3)."""
+    """Return the (V, 3) tube of length 1 along y, bent about z by two angles in radians."""
     along = np.linspace(0.0, 1.0, RINGS)
     turn = lower * np.clip((along - 0.2) / 0.2, 0, 1) + upper * np.clip((along - 0.6) / 0.2, 0, 1)
     tangents = np.stack([np.sin(turn), np.cos(turn), 0 * turn], axis=1)
@@ -48,7 +48,7 @@ def bent_tube(lower: float, upper: float) -> npt.NDArray[np.float64]:
 
 
 def bending_tube(n_poses: int = 16, most: float = 3.0, labelled: bool = False) -> PoseSet:
-    """Make a pose set whose first pose is straight, in a unit and place of its own."""
+    """Make a pose set whose first pose is straight, with an arbitrary unit and position."""
     angles = np.random.default_rng(5).uniform(-most, most, (n_poses, 2))
     angles[0] = 0.0
     vertices = np.stack([bent_tube(lower, upper) for lower, upper in angles])

@@ -1,4 +1,4 @@
-"""BVH files of rigs in motion, written by code that shares nothing with the reader."""
+"""BVH files of rigs in motion, written by code independent of the reader."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def bvh_text(
 
     Parameters
     ----------
-    names, parents, places : J joints in any order that has parents first, and (J, 3) where they are
-        at rest, in the file's axes and unit
-    turns : (T, J, 3, 3) of each joint against its parent
-    roots : (T, 3) places of the root
+    names, parents, places : J joints, parents first, and their (J, 3) rest positions, in the file's
+        axes and unit
+    turns : (T, J, 3, 3) rotations of each joint relative to its parent
+    roots : (T, 3) positions of the root
     order : of the rotation channels
-    ends : of joints, where their bones end, seen from them
+    ends : ends of joints' bones, relative to the joints
     """
     children: list[list[int]] = [[] for _ in names]
     for joint, parent in enumerate(parents):
@@ -70,12 +70,12 @@ def bvh_text(
 
 
 def joint_places(text: str) -> tuple[list[str], FloatArray, FloatArray, float]:
-    """Return what a BVH file says, by the words of the format alone.
+    """Read a BVH file independently of the project's reader.
 
     Returns
     -------
     names : of J joints, in the file's order
-    rest, places : (J, 3) at rest, and (T, J, 3), in the world
+    rest, places : (J, 3) rest positions, and (T, J, 3) world positions
     frame_time : seconds
     """
     head, _, tail = text.partition("MOTION")

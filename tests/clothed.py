@@ -1,4 +1,4 @@
-"""Clothed characters made here: shells that lie on a body, open at their rims, one cut at a seam.
+"""Synthetic clothed characters: open shells that lie on a body, one cut at a seam.
 
 ``python -m tests.clothed FILE.glb`` writes the large one.
 """
@@ -48,17 +48,17 @@ _JOINTS: dict[str, tuple[str, tuple[float, float, float]]] = {
         )
     },
 }
-"""Name, parent and place in the rest pose of the built-in body, in metres."""
+"""Name, parent and position in the rest pose of the built-in body, in metres."""
 
 _THICK = {"Hips": 0.14, "Spine": 0.13, "Spine1": 0.13, "Head": 0.1, "UpLeg": 0.08}
-"""Radii in metres of what the bones from these joints carry; 0.05 of others."""
+"""Radii in metres around the bones from these joints; 0.05 for others."""
 
 _SWEEPS = 10
-"""Of smoothing, by which the weights of neighbouring bones blend."""
+"""Number of smoothing sweeps, which blend the weights of neighbouring bones."""
 
 
 def clothed_woman() -> Character:
-    """Return the built-in body in shirt, trousers, jacket, skirt, belt, hair and shoes: z is up."""
+    """Return the built-in body in shirt, trousers, jacket, skirt, belt, hair and shoes, z up."""
     model = LearnedBody.load("body")
     skin, topology = model.reference, model.topology
     names = tuple(_JOINTS)
@@ -109,12 +109,12 @@ def clothed_woman() -> Character:
 
 
 def sleeved_tube() -> tuple[PoseSet, npt.NDArray[np.intp]]:
-    """Return poses of a bending tube with an open sleeve about its middle, 0.01 away from it.
+    """Return poses of a bending tube with an open sleeve around its middle, 0.01 away from it.
 
     Returns
     -------
     poses : of 840 vertices of the tube and those of the sleeve
-    covered : (n,) the vertices of the tube that those of the sleeve lie on
+    covered : (n,) the vertices of the tube under those of the sleeve
     """
     tube = bending_tube()
     finer = [subdivide(pose.astype(np.float64), tube.faces) for pose in tube.vertices]
@@ -135,11 +135,11 @@ def sleeved_tube() -> tuple[PoseSet, npt.NDArray[np.intp]]:
 def with_shells(
     body: Character, layers: dict[str, tuple[npt.NDArray[np.bool_], float]]
 ) -> Character:
-    """Add shells to a character: copies of a part of its skin, moved outwards, weights and all.
+    """Add shells to a character: copies of parts of its skin, moved outwards, with weights.
 
     Parameters
     ----------
-    layers : by name, (V,) which vertices of the body each covers, and how far it lies from them
+    layers : by name, a (V,) mask of the covered vertices, and the distance from them
     """
     normals = vertex_normals(body.rest_vertices, body.topology.faces)
     n_body = len(body.rest_vertices)
@@ -161,17 +161,17 @@ def _with_ring(
     heights: tuple[float, float],
     away: float,
 ) -> Character:
-    """Add a ring about a body, open above and below, with the weights of the nearest skin."""
+    """Add a ring around a body, open above and below, with the weights of the nearest skin."""
     n_sides, n_rings = 36, max(3, round(np.ptp(heights) / 0.04))
     angle = 2.0 * np.pi * np.arange(n_sides) / n_sides
     points, reach, depth = [], 0.0, np.zeros(2)
     for z in np.linspace(heights[1], heights[0], n_rings):
         near = skin[np.abs(skin[:, 2] - z) < 0.03]
-        # It never becomes narrower downwards.
+        # It never narrows downwards.
         reach = max(reach, float(np.abs(near[:, 0]).max()))
         depth = np.maximum(depth, [-near[:, 1].min(), near[:, 1].max()])
         wide, deep, middle = reach + away, 0.5 * depth.sum() + away, 0.5 * (depth[1] - depth[0])
-        # Of a shape between an ellipse and its box, so that no corner of the hips sticks out.
+        # A superellipse, so that no corner of the hips sticks out.
         round_ = np.maximum(np.abs(np.cos(angle)) ** 3 + np.abs(np.sin(angle)) ** 3, 1e-9) ** (
             -1 / 3
         )
@@ -192,7 +192,7 @@ def _joined(
     skin: npt.NDArray[np.integer],
     name: str,
 ) -> Character:
-    """Add a mesh to a character, with the weights of these vertices of its skin."""
+    """Add a mesh to a character, with the weights of the given vertices of its skin."""
     rig = body.rig
     assert rig is not None
     n_vertices, n_faces = len(body.rest_vertices), body.topology.n_faces
@@ -216,7 +216,7 @@ def _joined(
 
 
 def cut_at_a_seam(body: Character, name: str) -> Character:
-    """Cut a layer at x = 0, as files do where pictures end: the vertices there are twice."""
+    """Cut a layer at x = 0, as at a UV seam: duplicate the vertices there."""
     (faces,) = (group.faces for group in body.groups if group.name == name)
     corners = body.topology.faces[faces]
     on_right = body.rest_vertices[corners].mean(axis=1)[:, 0] < 0.0

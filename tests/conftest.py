@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 if "PYTEST_XDIST_WORKER" in os.environ:
-    # Each worker has a core of its own; threads of more than one would wait for each other. Read
-    # when torch is imported, by this process and by those that tests start.
+    # Each worker has one core, on which several threads would wait for each other. The variable is
+    # read when torch is imported, by this process and by those that tests start.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
@@ -20,7 +20,7 @@ from lcollision_core.files import PoseSet, read_pose_set
 from tests.app.support import Lcollision
 
 UNPUBLISHED = {"characters", "scape", "jumping"}
-"""Fixtures of data that only some have: tests of them are slow ones."""
+"""Fixtures of data that is not redistributed: tests that use them are marked slow."""
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -32,9 +32,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def _garbage_waits(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Keep Python's collector, as the editor does, from running while Qt destroys something.
+    """Keep Python's garbage collector, as the editor does, from running while Qt destroys objects.
 
-    Nor does it run between two tests with windows: what they left is destroyed there.
+    It does not run between two tests with windows either, where their remains are destroyed.
     """
     if "qtbot" not in request.fixturenames:
         gc.enable()
@@ -42,7 +42,7 @@ def _garbage_waits(request: pytest.FixtureRequest) -> Iterator[None]:
         return
     gc.disable()
     yield
-    # All of it would take as long as many a test.
+    # A full collection takes as long as many tests.
     gc.collect(1)
 
 

@@ -1,9 +1,9 @@
-"""What checkers of others say of the frames of a motion that is to be fit for cloth.
+"""Third-party checks of the frames of a motion that should be fit for cloth.
 
-``python -m tests.foreign_cloth CHARACTER.glb FRAMES.npz [PPF]`` counts in the file that the task
-`prepare` of `tests/app/blender/inside_cloth.py` wrote, by ipctk and by ppf-contact-solver's own
-check of meshes in Python. PPF is a folder with a package `ppf` that holds `_bvh_.py` and
-`_intersection_.py` of its `frontend` (of December 2025; later ones are in Rust).
+``python -m tests.foreign_cloth CHARACTER.glb FRAMES.npz [PPF]`` counts intersections in the file
+written by the task `prepare` of `tests/app/blender/inside_cloth.py`, with ipctk and with
+ppf-contact-solver's mesh check in Python. PPF is a folder with a package `ppf` that contains
+`_bvh_.py` and `_intersection_.py` of its `frontend` (of December 2025; later ones are in Rust).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ IntArray = npt.NDArray[np.int32]
 
 
 def by_ipctk(frames: FloatArray, faces: IntArray) -> tuple[list[int], list[int]]:
-    """Return which frames intersect, and after which something is hit on the linear path."""
+    """Return the frames that intersect, and those with a hit on the linear path to the next."""
     import ipctk
 
     topology = Topology(faces, frames.shape[1])
@@ -44,7 +44,7 @@ def by_ipctk(frames: FloatArray, faces: IntArray) -> tuple[list[int], list[int]]
 
 
 def faces_with(parts: npt.NDArray[Any], faces: npt.NDArray[Any]) -> list[list[int]]:
-    """Return of (n, k) groups of vertices the faces that have all of each."""
+    """Return, for each of (n, k) groups of vertices, the faces that contain all of them."""
     found: list[set[int]] = [set() for _ in range(faces.max() + 1)]
     for face, corners in enumerate(faces.tolist()):
         for corner in corners:
@@ -55,9 +55,9 @@ def faces_with(parts: npt.NDArray[Any], faces: npt.NDArray[Any]) -> list[list[in
 
 
 def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int], list[int]]:
-    """Return the frames that intersect, and after which something is hit, all searched by ipctk.
+    """Return the frames that intersect, and those with a hit before the next, found by ipctk.
 
-    The project only says of pairs of faces whether they count.
+    The project only decides which pairs of faces count.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int],
         counts = detector.rules_of(table[:, 1:], np.ones(len(table))) == 0
         return [candidates[row] for row in np.unique(table[counts, 0])]
 
-    # Most of what is near at rest, as far as single vertices tell: the rest is left to the rules.
+    # Skip most pairs near at rest, by single vertices; the rules decide on the rest.
     start, near = detector._exclusions.near_start, detector._exclusions.near
     first = np.repeat(np.arange(body.n_vertices), np.diff(start))
     apart_at_rest = np.linalg.norm(body.reference[first] - body.reference[near], axis=1)
@@ -122,7 +122,7 @@ def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int],
 
 
 def by_ppf(frames: FloatArray, faces: IntArray, folder: str) -> list[IntArray]:
-    """Return the (n, 2) pairs of triangles that ppf's own check finds in each frame."""
+    """Return the (n, 2) pairs of triangles that ppf's check finds in each frame."""
     if folder not in sys.path:
         sys.path.insert(0, folder)
     from ppf._intersection_ import check_self_intersection  # type: ignore[import-not-found]
@@ -133,14 +133,14 @@ def by_ppf(frames: FloatArray, faces: IntArray, folder: str) -> list[IntArray]:
 
 
 def counts(body: RigBody, frames: FloatArray, ppf: str | None) -> dict[str, Any]:
-    """Return in how many poses, and between how many, pairs that count cross; as JSON."""
+    """Return in how many poses, and between how many, counting pairs cross, as JSON values."""
     crossing, hit = hits_on_counted_pairs(body, frames)
     answer = {"poses": len(frames), "ipctk_crossing": len(crossing), "ipctk_hit": len(hit)}
     if ppf is None:
         return answer
     faces, n_crossing, n_pairs, n_left_out = body.topology.faces, 0, 0, 0
     for pairs in by_ppf(frames, faces, ppf):
-        # Two faces with a vertex in common are no pair of the project's.
+        # The project ignores two faces with a common vertex.
         share = (faces[pairs[:, 0], :, None] == faces[pairs[:, 1], None, :]).any(axis=(1, 2))
         rules = body.detector.rules_of(pairs[~share].astype(np.int32), np.ones((~share).sum()))
         n_crossing += int((rules == 0).any())

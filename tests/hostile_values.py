@@ -1,4 +1,4 @@
-"""What every field of a file is replaced by: other types, sizes, signs, NaN and infinities."""
+"""Hostile replacements of a file's fields: other types, sizes, signs, NaN and infinities."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ VALUES: tuple[Any, ...] = (
     [[1], "a"],
     {"a" * 100_000: None},
 )
-"""What every JSON value of a model file is replaced by."""
+"""Replacements of every JSON value of a model file."""
 
 NUMBERS = (0.0, -1.0, 1.0, 1e-38, 1e4, 1e30, 3e38, -1e300, np.nan, np.inf, -np.inf)
 WHOLE_NUMBERS = (0, -1, 1, 2**31 - 1, -(2**31))
 
 
 def as_json(value: Any) -> str:
-    """Write JSON with numbers that no reader should take."""
+    """Write JSON with numbers that no reader should accept."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"))
     return text.replace(f'"{TOO_LARGE}"', "1e999")
 
 
 def places(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Give the place of every JSON value, of a list's the first and the last item's."""
+    """Yield the path of every JSON value; of a list, only the first and the last item."""
     if place:
         yield place
     if isinstance(value, dict):
@@ -72,10 +72,10 @@ def with_value(metadata: Any, place: tuple[Any, ...], value: Any) -> Any:
 
 
 def changed_arrays(array: np.ndarray) -> Iterator[tuple[str, np.ndarray | None]]:
-    """Give an array with another type, another shape, or other numbers."""
+    """Yield an array with another type, another shape, or other numbers."""
     yield "missing", None
     if array.dtype.kind == "U":
-        # As numbers that stand for no character.
+        # Code points that are not characters.
         bad = np.full(array.shape + (array.dtype.itemsize // 4,), 0xFFFFFFFF, np.uint32)
         yield "no characters", bad.view(array.dtype).reshape(array.shape)
         for text in ("", "\ud800\n", "x" * 10_000):
@@ -114,13 +114,13 @@ UNPLAIN_FILES = {
     "a device": lambda path: path.symlink_to("/dev/zero"),
     "a socket": _socket,
 }
-"""What makes something that is no plain file at a path."""
+"""Functions that create something other than a regular file at a path."""
 
 
 def damaged_glbs(whole: bytes, n: int, seed: int) -> Iterator[bytes]:
-    """Yield a GLB file n times with some bytes changed, every fifth cut off besides.
+    """Yield a GLB file n times with some bytes changed, every fifth also truncated.
 
-    Every second is changed where its JSON lies, and not only in the many numbers behind that.
+    In every second, the changes are in the JSON, not in the large binary part behind it.
     """
     generator = np.random.default_rng(seed)
     json_end = 20 + int.from_bytes(whole[12:16], "little")

@@ -1,8 +1,8 @@
-"""Whether a mesh runs into itself, by code that shares nothing with the project's.
+"""A check for self-collisions that shares no code with the project.
 
-Two triangles in general position meet exactly where an edge of one pierces the other. Every edge
-is tried on every triangle near it; there is no tree, no depth, and no file reader of ours. Contact
-rules are applied pair by pair, by the text of docs/contact-rules.md.
+Two triangles in general position intersect if and only if an edge of one pierces the other. Every
+edge is tested against every triangle near it, without a tree, depths or the project's file readers.
+Contact rules are applied pair by pair, following docs/contact-rules.md.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ def read_obj(path: Path) -> tuple[Array, npt.NDArray[np.int64]]:
 
 
 def crossing_pairs(vertices: Array, faces: npt.NDArray[np.int64]) -> set[tuple[int, int]]:
-    """Return the pairs of triangles without a common vertex of which one pierces the other."""
+    """Return the pairs of triangles without a common vertex where one pierces the other."""
     corners = vertices[faces]
     middle = corners.mean(axis=1)
     radius = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
-    # The larger of two faces that touch has the other's middle within twice its own radius.
+    # If two faces touch, the smaller one's middle is within twice the larger one's radius.
     reached = cKDTree(middle).query_ball_point(middle, 2.0 * radius)
     larger = np.repeat(np.arange(len(faces)), [len(others) for others in reached])
     near = np.stack([larger, np.concatenate(reached).astype(np.int64)], axis=1)
@@ -59,7 +59,7 @@ def crossing_pairs(vertices: Array, faces: npt.NDArray[np.int64]) -> set[tuple[i
 
 
 class IndependentRules:
-    """Contact rules, applied pair by pair; what is found about a face is kept for later poses.
+    """Contact rules, applied pair by pair; results about a face are kept for later poses.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class IndependentRules:
     touching_at_rest : pairs of its faces
     rules : as in JSON
     groups : faces by name
-    joints : of each joint, the faces about it
+    joints : for each joint, the faces around it
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class IndependentRules:
     def _fold_limits(
         self, rest: Array, faces: npt.NDArray[np.int64], joints: list[set[int]]
     ) -> dict[int, float]:
-        """Return twice the limb's thickness at the nearest joint, of each vertex."""
+        """Return, for each vertex, twice the limb's thickness at the nearest joint."""
         own: dict[int, float] = {}
         for about in joints:
             middles = np.array([rest[faces[face]].mean(axis=0) for face in sorted(about)])
@@ -126,7 +126,7 @@ class IndependentRules:
         return {vertex: own.get(int(at), np.inf) for vertex, at in enumerate(nearest)}
 
     def _may_fold(self, a: int, b: int) -> bool:
-        """Whether a corner of each are near along the surface, and near in space at rest."""
+        """Whether some corners of both faces are near along the surface and in space at rest."""
         for i in self._corners[a]:
             reached = self._vertices_around([i], self._near)
             for j in self._corners[b]:
@@ -141,7 +141,7 @@ class IndependentRules:
         return False
 
     def excluding(self, pairs: Mapping[tuple[int, int], float]) -> dict[tuple[int, int], str]:
-        """Return the first rule that excludes each pair; those that count are left out.
+        """Return the first rule that excludes each pair; omit pairs that count.
 
         Parameters
         ----------
@@ -181,7 +181,7 @@ class IndependentRules:
         return any(self._touched.get(face, set()) & by_b for face in self._faces_around(a, radius))
 
     def _faces_around(self, face: int, radius: float) -> set[int]:
-        """Faces with a corner at most so far from one of this face, along edges, by Dijkstra."""
+        """Faces with a corner within `radius` of one of this face, along edges, by Dijkstra."""
         if radius == 0.0:
             return {face}
         known = self._around.get((face, radius))
@@ -214,9 +214,9 @@ def faces_about_joints(
     places: Array,
     main_joint: list[int],
 ) -> list[set[int]]:
-    """Return the faces about each joint and between two that branch, by docs/contact-rules.md.
+    """Return the faces around each joint and between branching ones, by docs/contact-rules.md.
 
-    For rigs without twist joints, whose joints that move nothing stand for no other.
+    For rigs without twist joints and without unused joints that stand for others.
     """
     size = float(np.ptp(rest[np.unique(faces)], axis=0).max())
     owner = [
@@ -271,7 +271,7 @@ def faces_about_joints(
 
 
 def _pierces(start: Array, stop: Array, triangle: Array) -> npt.NDArray[np.bool_]:
-    """Tell which segments cross their triangles: signs of volumes of tetrahedra."""
+    """Return which segments cross their triangles, by signs of tetrahedra's volumes."""
     a, b, c = triangle.transpose(1, 0, 2)
 
     def side(p: Array, q: Array, r: Array, s: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Characters made here: a tube on a chain of joints, and a body of tubes on a tree of them."""
+"""Synthetic characters: a tube on a chain of joints, and a body of tubes on a tree of joints."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _JOINTS: dict[str, tuple[str, tuple[float, float, float]]] = {
         )
     },
 }
-"""Name, parent and place; z is up, and the body faces -y."""
+"""Name, parent and position; z is up, and the body faces -y."""
 
 _LIMBS: tuple[tuple[tuple[str, ...], float, float], ...] = (
     (("Hips", "Spine", "Neck"), 0.13, 0.06),
@@ -57,7 +57,7 @@ _LIMBS: tuple[tuple[tuple[str, ...], float, float], ...] = (
         )
     ),
 )
-"""The joints along each tube, its radius, and how far it stays from its ends."""
+"""The joints along each tube, its radius, and its gap to the end joints."""
 
 
 def rigged_tube(
@@ -67,14 +67,14 @@ def rigged_tube(
 
     Parameters
     ----------
-    frames : give it a clip of random turns
-    differs : give the joints points of their own, as where the rest pose is not the bind pose
+    frames : of a clip of random turns
+    differs : give the joints separate points, as if the rest pose were not the bind pose
     """
     vertices = bent_tube(0.0, 0.0) * scale
     places = np.linspace(0.1, 0.7, n_joints) if n_joints > 1 else np.array([0.5])
     rest = np.broadcast_to(np.eye(4), (n_joints, 4, 4)).copy()
     rest[:, 1, 3] = places * scale
-    # A joint's own axes do not matter for what it can do.
+    # A joint's own axes must not matter.
     rest[:, :3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     along = vertices[:, 1] / scale
     width = 0.1
@@ -140,7 +140,7 @@ def rigged_body(scale: float = 1.0, n_frames: int = 0, girth: float = 0.13) -> C
 
 
 def head_in_torso(n_frames: int = 0) -> Character:
-    """Return the body with its head moved down, so that it stands in the trunk in every pose."""
+    """Return the body with its head moved down, so that it is in the trunk in every pose."""
     body = rigged_body(n_frames=n_frames)
     assert body.rig is not None
     (head,) = (group for group in body.groups if group.name == "Head")
@@ -152,9 +152,9 @@ def head_in_torso(n_frames: int = 0) -> Character:
 
 
 def sunk_arm(n_frames: int = 10) -> Character:
-    """Return the body with a clip in which the left arm hangs in the trunk, at one place.
+    """Return the body with a clip in which the left arm stays in the trunk.
 
-    By turns, the right arm is in the head too, and one thigh in the other.
+    Alternately, the right arm is in the head, or one thigh in the other.
     """
     body = rigged_body()
     rig = body.rig
@@ -174,7 +174,7 @@ def sunk_arm(n_frames: int = 10) -> Character:
 
 
 def skirted_body() -> Character:
-    """Return the body with a skirt, an open cone about its thighs, most of which follows these."""
+    """Return the body with a skirt, an open cone around its thighs that mostly follows them."""
     body = rigged_body()
     rig, n_rows, n_around = body.rig, 9, 24
     assert rig is not None
@@ -207,7 +207,7 @@ def skirted_body() -> Character:
 def turned(rig: Rig, turns: FloatArray) -> FloatArray:
     """Return the (..., J, 4, 4) global transforms of joints turned by (..., J, 3, 3) rotations.
 
-    Each turns about its place, in the axes of the character, and carries those below it.
+    Each turns about its position, in the character's axes, and carries its descendants.
     """
     places = rig.rest[:, :3, 3]
     moved = np.zeros((*turns.shape[:-2], 4, 4))
@@ -271,7 +271,7 @@ def character_of(
 
 
 def limb(places: FloatArray, radius: float, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return a tube along (n, 3) places, and its vertices' (V, n - 1) weights by segment."""
+    """Return a tube along (n, 3) points, and its vertices' (V, n - 1) weights by segment."""
     lengths = np.linalg.norm(np.diff(places, axis=0), axis=1)
     ends = np.concatenate([[0.0], np.cumsum(lengths)])
     along = np.linspace(gap, ends[-1] - gap, _LIMB_RINGS)
@@ -292,7 +292,7 @@ def limb(places: FloatArray, radius: float, gap: float) -> tuple[FloatArray, Flo
 
 
 def limb_faces() -> npt.NDArray[np.int32]:
-    """Return the faces of `tests.bending_tube`'s tube, of fewer rings."""
+    """Return the faces of a tube like that of `tests.bending_tube`, with fewer rings."""
     faces = tube_topology().faces
     first_dropped = _LIMB_RINGS * SIDES
     removed = (RINGS - _LIMB_RINGS) * SIDES
@@ -311,10 +311,10 @@ def write_gltf(
     interpolation: str = "LINEAR",
     shifts: Mapping[str, FloatArray] | None = None,
 ) -> Path:
-    """Write a character that is z up as glTF, which is y up, with its rig and its clips.
+    """Write a z-up character as glTF, which is y up, with its rig and its clips.
 
-    Of the clips that is how the joints turn and where the root goes. Cubic keys have tangents of
-    zero. Joints with `shifts`, (T, 3) arrays by their names, are moved off their places by these.
+    Clips have rotations of the joints and translations of the root. Cubic keys have zero tangents.
+    `shifts` are (T, 3) translations of further joints, by name.
     """
     rig = character.rig
     assert rig is not None
@@ -360,7 +360,7 @@ def write_gltf(
                 way = {"node": first + joint, "path": "translation", "values": own + moves}
                 channels.append(way | {"times": frames.times})
             places = frames.transforms[:, joint, :3, 3]
-            # Linear whatever the turns are.
+            # Linear, whatever the interpolation of the turns.
             if parent < 0 and np.ptp(places, axis=0).any():
                 way = {"node": first + joint, "path": "translation", "values": places}
                 channels.append(way | {"times": frames.times})

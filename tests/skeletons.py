@@ -1,4 +1,4 @@
-"""Skeletons of people and animals with tubes round their bones, under names of any kind."""
+"""Skeletons of people and animals with tubes around their bones and arbitrary names."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _N_ROUND, _N_ALONG = 6, 4
 
 
 def both_sides(joints: Sequence[tuple[str, str, tuple[float, float, float]]]) -> Joints:
-    """Return joints for the left and the right, called L and R, from those of the left."""
+    """Return joints of both sides, called L and R, from those of the left."""
     return {
         f"{side} {name}": (f"{side} {parent}" if parent in own else parent, (sign * x, y, z))
         for side, sign in (("L", 1.0), ("R", -1.0))
@@ -81,12 +81,12 @@ def character_from(
     turn: FloatArray | None = None,
     up: Sequence[float] = (0.0, 1.0, 0.0),
 ) -> Character:
-    """Make a character with a tube from each joint to its first child, on from it at an end.
+    """Make a character with a tube from each joint to its first child, or beyond an end joint.
 
     Parameters
     ----------
-    renamed : a joint's name by its number and its name here
-    turn : (3, 3) rotation of all of it
+    renamed : returns a joint's name from its index and its name here
+    turn : (3, 3) rotation of the whole character
     """
     names = list(joints)
     places = np.array([place for _, place in joints.values()])

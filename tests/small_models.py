@@ -1,6 +1,6 @@
-"""The small models and the small clips of `tests/data`, as made anew and as stored.
+"""The small models and clips of `tests/data`, newly made and stored.
 
-``python -m tests.small_models`` writes the files; those of `SHAPED` are as they came.
+``python -m tests.small_models`` writes the files, except those of `SHAPED`.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from tests.rigged_shapes import write_gltf
 
 DATA = Path(__file__).parent / "data"
 SWING = DATA / "swing.glb"
-"""The character `swinging_body` with both of its clips."""
+"""The character `swinging_body` with both its clips."""
 
 SHAPED = (DATA / "scale_forearm.glb", DATA / "arm_morph.glb")
-"""Characters whose clip scales a joint, and weighs a morph target."""
+"""Characters with a clip that scales a joint, and one that animates a morph target."""
 
 LEVEL2_RATES = {"tube": 0.01, "editor_tube": 0.04}
-"""By the name of a model's file, how fast its level 2 learned."""
+"""Learning rate of level 2, by the name of a model's file."""
 
 
 def stored(name: str) -> LearnedBody:
-    """Return the model of a file in `DATA`, called "tube", without a predictor."""
+    """Return the model of a file in `DATA`, named "tube", without a predictor."""
     model = LearnedBody.load(DATA / f"{name}.safetensors")
     return LearnedBody("tube", model.embedding, model.card)
 
 
 def trained(name: str) -> LearnedBody:
-    """Train it: a tube that bends at two joints, with two domains of three codes."""
+    """Train the model: a tube that bends at two joints, with two domains of three codes."""
     from lcollision_core.embedding.training import train_embedding
     from lcollision_core.embedding.training_run import EmbeddingConfig
 

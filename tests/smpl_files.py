@@ -1,4 +1,4 @@
-"""Body models of the layout of SMPL, SMPL-H and SMPL-X, made of the built-in body; and motions."""
+"""Body models in the layout of SMPL, SMPL-H and SMPL-X, from the built-in body; and motions."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ _LEFT = {
     18: (0.317, 1.115, 0.045),
     20: (0.473, 0.948, 0.123),
 }
-"""Where joints of the left and the middle are in the built-in body, by their numbers in SMPL."""
+"""Positions of the left and middle joints in the built-in body, by their numbers in SMPL."""
 
 _PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19]
 _LEFT_WRIST, _RIGHT_WRIST, _HEAD = 20, 21, 15
 _FACE = ((0.0, 1.47, 0.05), (0.03, 1.54, 0.1), (-0.03, 1.54, 0.1))
 _TIP = (0.55, 0.83, 0.19)
-"""Of the left hand."""
+"""Tip of the left hand."""
 
 
 @cache
@@ -55,7 +55,7 @@ def _mesh() -> tuple[FloatArray, npt.NDArray[np.int32]]:
 
 
 def _joints(n_joints: int) -> tuple[FloatArray, list[int]]:
-    """Return where the joints of SMPL, SMPL-H or SMPL-X are, and their parents."""
+    """Return the positions of the joints of SMPL, SMPL-H or SMPL-X, and their parents."""
     places, parents = np.zeros((22, 3)), list(_PARENTS)
     for joint, place in (_MIDDLE | _LEFT).items():
         places[joint] = place
@@ -81,7 +81,7 @@ def _joints(n_joints: int) -> tuple[FloatArray, list[int]]:
 
 
 def smpl_arrays(n_joints: int = 55, n_shapes: int = 10, seed: int = 0) -> Arrays:
-    """Return the arrays of a model file; the directions of shapes and poses are made up."""
+    """Return the arrays of a model file, with made-up shape and pose directions."""
     vertices, faces = _mesh()
     joints, parents = _joints(n_joints)
     generator = np.random.default_rng(seed)
@@ -89,10 +89,10 @@ def smpl_arrays(n_joints: int = 55, n_shapes: int = 10, seed: int = 0) -> Arrays
     normals = vertex_normals(vertices, faces)
     shapes = np.empty((len(vertices), 3, n_shapes))
     for number in range(n_shapes):
-        # Higher, and wider here and there.
+        # Taller, and wider in places.
         width = 0.01 * np.cos(3.0 * vertices @ generator.normal(size=3))
         shapes[..., number] = 0.01 * generator.normal(size=3) * vertices + width[:, None] * normals
-    # Each joint bulges the skin about it, by up to about a centimetre.
+    # Each joint bulges the skin around it, by up to about a centimetre.
     near = weights[:, 1:] + np.take(weights, parents[1:], axis=1)
     bulge = 0.006 * generator.normal(size=(9 * (n_joints - 1), 3))
     bulge = bulge[None] + 0.006 * generator.normal(size=(1, len(bulge), 1)) * normals[:, None]
@@ -110,7 +110,7 @@ def smpl_arrays(n_joints: int = 55, n_shapes: int = 10, seed: int = 0) -> Arrays
 
 
 def tiny_arrays() -> Arrays:
-    """Return the arrays of a model of SMPL's layout: a tetrahedron about each of its joints."""
+    """Return the arrays of a model in SMPL's layout: a tetrahedron around each joint."""
     generator = np.random.default_rng(3)
     joints, parents = _joints(24)
     corners = 0.03 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -130,7 +130,7 @@ def tiny_arrays() -> Arrays:
 
 
 def _weights(vertices: FloatArray, joints: FloatArray, parents: list[int]) -> FloatArray:
-    """Return (V, J) weights, at most 4 a vertex, by the distance to the bones of its own side."""
+    """Return (V, J) weights, at most 4 per vertex, by the distance to bones of the same side."""
     distance = np.full((len(vertices), len(joints)), np.inf)
     children = {parent: joint for joint, parent in enumerate(parents)}
     for joint, start in enumerate(joints):
@@ -148,7 +148,7 @@ def _weights(vertices: FloatArray, joints: FloatArray, parents: list[int]) -> Fl
 
 
 def _regressor(vertices: FloatArray, joints: FloatArray) -> FloatArray:
-    """Return (J, V) numbers that give the joints, of few vertices each."""
+    """Return the sparse (J, V) regressor of the joints."""
     regressor = np.zeros((len(joints), len(vertices)))
     for joint, place in enumerate(joints):
         near = np.linalg.norm(vertices - place, axis=1).argsort()[:12]
@@ -166,9 +166,9 @@ def write_model(path: Path, n_joints: int = 55, **rest: int) -> Path:
 def motion_arrays(
     n_joints: int = 55, n_frames: int = 40, seed: int = 0, *, z_is_up: bool = False
 ) -> Arrays:
-    """Return the arrays of a motion as AMASS has them: an arm swings into the body and out again.
+    """Return the arrays of a motion in AMASS's layout: an arm swings into the body and out again.
 
-    Elsewhere it moves a little, and it is shaped and goes somewhere, as the seed says.
+    Small motions elsewhere, the shape and the path depend on the seed.
     """
     generator = np.random.default_rng(seed)
     share = np.linspace(0.0, 1.0, n_frames)
@@ -195,7 +195,7 @@ def motion_arrays(
 
 
 def write_motion(path: Path, **rest: Any) -> Path:
-    """Write a motion as AMASS does."""
+    """Write a motion in AMASS's layout."""
     np.savez(path, **motion_arrays(**rest))
     return path
 

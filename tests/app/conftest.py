@@ -1,4 +1,4 @@
-"""What the tests of the command line and of the editor share."""
+"""Fixtures of the command line's and the editor's tests."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ from tests.small_models import SWING
 
 
 class PatientBot(QtBot):
-    """Waits for what never comes in a failure only: as long as a busy machine may take.
+    """Waits as long as a busy machine may take; only a failing test waits that long.
 
-    What should not come is waited for no longer than a test says.
+    Checks that a signal does not come take no longer than the test asks for.
     """
 
     def waitUntil(self, callback: Any, *, timeout: int = PATIENCE) -> None:  # noqa: N802
@@ -57,20 +57,20 @@ class PatientBot(QtBot):
 
 @pytest.fixture
 def qtbot(request: pytest.FixtureRequest) -> QtBot:
-    """Return pytest-qt's robot, of more patience."""
+    """Return pytest-qt's robot with longer timeouts."""
     request.getfixturevalue("qapp")
     return PatientBot(request)
 
 
 @pytest.fixture(autouse=True)
 def _plain_edges(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw edges without samples: in software these take a third of the time of most tests."""
+    """Draw without multisampling: in software it takes a third of the time of most tests."""
     monkeypatch.setattr(canvas, "_SMOOTH_SAMPLES", 0)
 
 
 @pytest.fixture(autouse=True)
 def _own_data(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep models and pose libraries of a test in a folder of its own, never the user's."""
+    """Keep a test's models and pose libraries in a separate folder, never the user's."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path_factory.mktemp("data")))
 
 
@@ -92,13 +92,13 @@ def apart(tmp_path: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def _opens_instead(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Open what is dropped on a character in its place, as the dialog's default does."""
+    """Let a dropped character replace the open one, as the dialog's default does."""
     monkeypatch.setattr(file_actions, "ask_to_join", lambda *_: Choice.DISCARD)
 
 
 @pytest.fixture(autouse=True)
 def _releases_its_buttons() -> Iterator[None]:
-    """See that a test holds no mouse button at its end: the next one's pointer would drag."""
+    """Check that no mouse button is held after a test: the next test's pointer would drag."""
     yield
     assert QApplication.mouseButtons() == Qt.MouseButton.NoButton
 
@@ -108,7 +108,7 @@ def editor_model(tmp_path_factory: pytest.TempPathFactory) -> LearnedBody:
     """Return a small model with a predictor, and nothing left to compile for its frames."""
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
-        # All workers take what the first of them has trained.
+        # All workers use the model that the first of them trains.
         folder = folder.parent
     path = folder / "editor" / "tube.safetensors"
     path.parent.mkdir(exist_ok=True)
@@ -130,13 +130,13 @@ def colliding(editor_model: LearnedBody) -> npt.NDArray[np.float64]:
 
 @pytest.fixture(scope="session")
 def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the file of a character whose arm swings through its trunk; only read it."""
+    """Return the file of a character whose arm swings through its trunk; do not change it."""
     return Path(shutil.copy(SWING, tmp_path_factory.mktemp("swing")))
 
 
 @pytest.fixture(scope="session")
 def compiled_body() -> None:
-    """Compile what a window with the bundled body needs: the first time that takes a minute."""
+    """Compile what a window with the bundled body needs; this takes a minute the first time."""
     model = LearnedBody.load(find_model("body"))
     warm_up(model)
     prepare(model, Job())
@@ -144,8 +144,8 @@ def compiled_body() -> None:
 
 
 def _begin(qtbot: QtBot, document: PoseDocument, model: LearnedBody) -> None:
-    """Let a document begin with a model, its pose all zeros, predicted and checked."""
-    # Poses are then what the tests set, at once.
+    """Set a document's model, and wait until its all-zero pose is predicted and checked."""
+    # Without Solid, poses are at once what the tests set.
     document.motion.set_solid(False)
     document.set_model(model)
     document.motion.reset_all()
@@ -153,7 +153,7 @@ def _begin(qtbot: QtBot, document: PoseDocument, model: LearnedBody) -> None:
     document.history.mark_saved()
 
     def settle() -> None:
-        # The frame with the prediction comes after one without; either is checked.
+        # The frame with the prediction follows one without; either may be checked.
         motion = document.motion
         frame, exact = motion.frame, motion.exact
         assert frame is not None, "no frame has come"
@@ -165,14 +165,14 @@ def _begin(qtbot: QtBot, document: PoseDocument, model: LearnedBody) -> None:
 
 
 def shares_window(request: pytest.FixtureRequest) -> bool:
-    """Return whether a test takes the window of its module."""
+    """Return whether a test uses its module's shared window."""
     one, own = (request.node.get_closest_marker(name) for name in ("one_window", "own_window"))
     return one is not None and own is None
 
 
 @pytest.fixture(scope="module")
 def kept_windows() -> Iterator[list[MainWindow]]:
-    """Return the window that the tests of a module marked `one_window` share, once one is open."""
+    """Return a list for the window that the tests of a module marked `one_window` share."""
     windows: list[MainWindow] = []
     yield windows
     for held in filter(is_open, windows):
@@ -185,9 +185,9 @@ def kept_windows() -> Iterator[list[MainWindow]]:
 def document(
     request: pytest.FixtureRequest, qtbot: QtBot, editor_model: LearnedBody
 ) -> Iterator[PoseDocument]:
-    """Return a document, its pose all zeros, predicted and checked; its threads end with it.
+    """Return a document with an all-zero pose, predicted and checked; its threads end with it.
 
-    In a module marked `one_window`, it is that of the window, which begins again.
+    In a module marked `one_window`, it is the reset document of the shared window.
     """
     kept: list[MainWindow] = []
     if shares_window(request) and "window" in request.fixturenames:
@@ -211,7 +211,7 @@ def window(
 ) -> Iterator[MainWindow]:
     """Return a window of the document that has drawn its pose.
 
-    It closes with the test, or in a module marked `one_window` after the last.
+    It closes after the test, or in a module marked `one_window` after the last test.
     """
     if shares_window(request):
         kept = request.getfixturevalue("kept_windows")
@@ -233,7 +233,7 @@ def body(compiled_body: None) -> LearnedBody:  # noqa: ARG001
 
 @pytest.fixture
 def body_window(qtbot: QtBot, body: LearnedBody, tmp_path: Path) -> Iterator[MainWindow]:
-    """Return a window with the bundled body and a document of its own."""
+    """Return a window with the bundled body and a separate document."""
     document = PoseDocument(body, library_folder=tmp_path / "library")
     held = open_window(qtbot, document, settings_in(tmp_path), (1280, 860))
     yield held

@@ -1,4 +1,4 @@
-"""A small model with a predictor, for all tests of the editor."""
+"""A small model with a predictor, for the editor's tests."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ def trained_tube() -> LearnedBody:
     bare = stored("editor_tube")
     labeller = bare.labeller()
     rows = labeller.label_rows(0, range(32))
-    # The mean of the weights would lag behind: two passes are few.
+    # Averaged weights would lag behind after only two epochs.
     quick = replace(PRESETS["paper"], epochs=2, average_passes=0.0)
     predictor = train_predictor(rows, bare.embedding, quick)
     return bare.with_predictor(predictor)
 
 
 def another_model(model: LearnedBody) -> LearnedBody:
-    """Store a model of another latent space among the user's as "snake"; it has no predictor."""
+    """Store a model of another latent space as the user's "snake", without a predictor."""
     shifted = model.embedding.mean_features + np.float32(1e-3)
     path = user_models_folder() / "snake.safetensors"
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""``python -m tests.app.quick_learner WORK_FOLDER``: the learner, with efforts of some seconds."""
+"""``python -m tests.app.quick_learner WORK_FOLDER``: the learner, reduced to some seconds."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ EFFORTS.update(
 )
 
 
-# On a busy machine the tests would wait for what gives way to all others.
+# On a busy machine, the tests would wait for a process of low priority.
 learner._NICENESS = 1
 
 
 def slow_down() -> None:
-    """Let each progress take long, so that a test can come in between."""
+    """Slow down each progress report, so that a test can act in between."""
     seconds = float(os.environ.get("SECONDS_PER_STEP", "0"))
     tell = Pace.tell
 

@@ -1,4 +1,4 @@
-"""A small colliding mesh, and what runs the command line and sees that it refuses."""
+"""A small colliding mesh, and helpers that run the command line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ v 0.3 0.2 0.9
 f 1 2 3
 f 4 5 6
 """
-"""Two triangles, one of which reaches 0.1 through the other; the mesh is 1 high."""
+"""Two triangles, one of which penetrates the other by 0.1; the mesh is 1 high."""
 
 
 class Lcollision(Protocol):
@@ -32,7 +32,7 @@ class Lcollision(Protocol):
 
 
 def refusal(lcollision: Lcollision, *arguments: object) -> str:
-    """Run a command that must fail for bad input, and return its one sentence."""
+    """Run a command that must refuse its input, and return its one sentence."""
     result = lcollision(*arguments)
     assert result.exit_code == 2, result.output
     assert result.stdout == ""

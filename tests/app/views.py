@@ -1,4 +1,4 @@
-"""What the tests of the viewport share: pictures of the screen, and places on it."""
+"""Helpers of viewport tests: pictures of the screen, and positions on it."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def rest(qtbot: QtBot, viewport: Viewport) -> None:
 
 
 def pixels(viewport: Viewport) -> npt.NDArray[np.int64]:
-    """Return what the screen shows of the viewport, (SIDE, SIDE, 3)."""
-    # Qt hands the picture to the screen after it is drawn.
+    """Return the viewport's pixels on the screen, (SIDE, SIDE, 3)."""
+    # Qt passes the picture to the screen after it is drawn.
     QTest.qWait(30)
     image = QGuiApplication.primaryScreen().grabWindow(viewport.winId()).toImage()
     image = image.convertToFormat(QImage.Format.Format_RGB888)
@@ -55,7 +55,7 @@ def pixels(viewport: Viewport) -> npt.NDArray[np.int64]:
 
 
 def steady_pixels(qtbot: QtBot, viewport: Viewport) -> npt.NDArray[np.int64]:
-    """Return what the screen shows once it shows the same for a while: a busy machine lags."""
+    """Return the viewport's pixels once they are stable: a busy machine lags."""
     shown = [pixels(viewport)]
 
     def stays() -> bool:
@@ -72,7 +72,7 @@ def changed(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> npt.
 
 
 def on_screen(canvas: Canvas, point: npt.NDArray[np.floating]) -> QPointF:
-    """Return where a (3,) point of the scene is seen in the widget, in pixels of the window."""
+    """Return the position of a (3,) point of the scene in the widget, in pixels of the window."""
     renderer, ratio = canvas.renderer, canvas.devicePixelRatioF()
     renderer.SetWorldPoint(*point.tolist(), 1.0)
     renderer.WorldToDisplay()
@@ -87,17 +87,17 @@ def place_of(viewport: Viewport, vertex: int) -> QPoint:
 
 
 def point_at(qtbot: QtBot, viewport: Viewport, vertex: int) -> QPoint:
-    """Put the pointer on a vertex that is seen, until the viewport knows; return where that is."""
+    """Move the pointer to a visible vertex until the viewport notices; return its position."""
     canvas, place = viewport.canvas, place_of(viewport, vertex)
     assert canvas is not None
 
     def is_known() -> bool:
-        # A pointer that is there already, from a test before, does not move.
+        # A pointer that is already there, from an earlier test, does not move.
         QTest.mouseMove(canvas, QPoint(3, 3))
         qtbot.wait(60)
         QTest.mouseMove(canvas, place)
         for _ in range(40):
-            # A loaded machine picks late.
+            # A busy machine picks late.
             qtbot.wait(50)
             if viewport.pointed_vertex == vertex:
                 return True
@@ -110,13 +110,13 @@ def point_at(qtbot: QtBot, viewport: Viewport, vertex: int) -> QPoint:
 def double_click(
     widget: QWidget, place: QPoint, button: Qt.MouseButton = Qt.MouseButton.LeftButton
 ) -> None:
-    """Press a button for the second time and release it: Qt's own double-click keeps it pressed."""
+    """Double-click and release the button: Qt's own double-click keeps it pressed."""
     QTest.mouseDClick(widget, button, pos=place)
     QTest.mouseRelease(widget, button, pos=place)
 
 
 def point_beside(qtbot: QtBot, viewport: Viewport) -> None:
-    """Put the pointer into a corner, beside the body, until the viewport knows."""
+    """Move the pointer to a corner, beside the body, until the viewport notices."""
     canvas = viewport.canvas
     assert canvas is not None
 
@@ -130,9 +130,9 @@ def point_beside(qtbot: QtBot, viewport: Viewport) -> None:
 
 
 def seen_vertex(viewport: Viewport, domain: int, among: Collection[int] | None = None) -> int:
-    """Return a vertex of a domain that nothing hides, and that is not at the body's very rim.
+    """Return a visible vertex of a domain, not right at the silhouette.
 
-    It is one of `among`, where that is given.
+    It is one of `among` if given.
     """
     canvas, scene = viewport.canvas, viewport.scene
     assert canvas is not None
@@ -142,7 +142,7 @@ def seen_vertex(viewport: Viewport, domain: int, among: Collection[int] | None =
     for vertex in np.argsort(-mask[domain]).tolist():
         if among is not None and vertex not in among:
             continue
-        # Of the pixel that the pointer will be on.
+        # Use the pixel that the pointer will be on.
         place = QPointF(place_of(viewport, vertex))
         picked = canvas.pick(place, scene.body)
         is_inside = all(canvas.pick(place + step, scene.body) is not None for step in around)

@@ -1,4 +1,4 @@
-"""An editor's window for tests: made, waited for, looked at, and taken away without a trace."""
+"""Helpers that open an editor's window for tests, wait for it, inspect it and dispose of it."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from app.window.panels.sliders import CodeRow
 from app.window.widgets import HANDLE
 
 SHOTS = Path(__file__).parents[2] / "out" / "screenshots"
-"""Where tests leave pictures of the window, for people to look at."""
+"""Folder of screenshots that tests leave for people to look at."""
 
 SIZE = (1280, 800)
-"""Of a window, in pixels."""
+"""Size of a window, in pixels."""
 
 PATIENCE = 120_000
-"""Milliseconds to wait for a machine that does other things too."""
+"""Timeout on a busy machine, in milliseconds."""
 
 
 def settings_in(folder: Path) -> Settings:
     """Return settings that nothing else reads."""
     settings = Settings(QSettings(str(folder / "editor.ini"), QSettings.Format.IniFormat))
-    # Poses are then what the tests set, at once.
+    # Without Solid, poses are at once what the tests set.
     settings["solid"] = False
     return settings
 
@@ -67,7 +67,7 @@ def open_window(
 
 
 def begin_again(window: MainWindow) -> None:
-    """Take what a test left from a window: dialogs, panels' places, choices, searched words."""
+    """Reset a window after a test: dialogs, panels' layout, choices, search texts."""
     for dialog in window.findChildren(QDialog):
         dialog.close()
         dialog.deleteLater()
@@ -94,14 +94,14 @@ def begin_again(window: MainWindow) -> None:
 
 
 def application() -> QApplication:
-    """Return the application of all tests."""
+    """Return the application that all tests share."""
     held = QApplication.instance()
     assert isinstance(held, QApplication)
     return held
 
 
 def close_window(window: MainWindow) -> None:
-    """Close a window whose changes may be lost, and see that nothing of it runs on."""
+    """Close a window, discarding changes, and check that nothing of it keeps running."""
     window.document.motion.end_gesture()
     window.document.history.mark_saved()
     assert window.close()
@@ -109,7 +109,7 @@ def close_window(window: MainWindow) -> None:
 
 
 def dispose(window: MainWindow) -> None:
-    """Delete a window that is closed, and see that it leaves neither thread nor timer."""
+    """Delete a closed window, and check that it leaves neither thread nor timer."""
     assert not window.isVisible()
     running = [timer for timer in window.findChildren(QTimer) if timer.isActive()]
     assert running == []
@@ -127,16 +127,16 @@ def rest(qtbot: QtBot, window: MainWindow) -> None:
 
 
 def is_checked(window: MainWindow, n_frames: int) -> bool:
-    """Return whether the strip shows what each of a motion's frames was found to be.
+    """Return whether the strip shows the check of every frame of a motion.
 
-    `Timeline.checks` may know a frame before the window is told of it.
+    `Timeline.checks` may have a frame before the window is notified.
     """
     shown = window.timeline.strip._overlaps()
     return len(shown) == n_frames and not np.isnan(shown).any()
 
 
 def settle_layout(qtbot: QtBot, window: MainWindow) -> None:
-    """Wait until the window and its panels have the same places at two looks."""
+    """Wait until the window and its panels have the same geometry twice in a row."""
     looks: list[list[QRect]] = []
 
     def rests() -> bool:
@@ -152,24 +152,24 @@ def is_open(window: MainWindow) -> bool:
 
 
 def shown(window: MainWindow) -> npt.NDArray[np.float32]:
-    """Return a copy of the vertices that are on the screen."""
+    """Return a copy of the vertices on the screen."""
     assert window.viewport.scene is not None
     return window.viewport.scene.surface.vertices.copy()
 
 
 def colours(window: MainWindow) -> npt.NDArray[np.uint8]:
-    """Return a copy of the vertices' colours that are on the screen."""
+    """Return a copy of the vertex colours on the screen."""
     assert window.viewport.scene is not None
     return window.viewport.scene.surface.colours.copy()
 
 
 def decoded(document: PoseDocument) -> npt.NDArray[np.float32]:
-    """Return the vertices that ought to be on the screen."""
+    """Return the vertices that should be on the screen."""
     return document.model.decode(document.history.latent).astype(np.float32)
 
 
 def handle(row: CodeRow) -> QPoint:
-    """Return where a row's handle is, in its slider."""
+    """Return the position of a row's handle in its slider."""
     slider = row.slider
     low, high = slider.ends
     share = (slider.place - low) / (high - low)
@@ -187,7 +187,7 @@ def drag(qtbot: QtBot, row: CodeRow, by: int, steps: int = 6) -> None:
 
 
 def move_held(widget: QWidget, place: QPoint, key: Qt.KeyboardModifier) -> None:
-    """Move the pointer with the left button and perhaps a key held."""
+    """Move the pointer with the left button, and perhaps a key, held."""
     QApplication.sendEvent(
         widget,
         QMouseEvent(
@@ -207,7 +207,7 @@ def drop(window: QWidget, *paths: Path) -> None:
     dropped.setUrls([QUrl.fromLocalFile(str(path)) for path in paths])
     buttons, keys = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
     place, action = QPoint(400, 300), Qt.DropAction.CopyAction
-    # From 6.12 on another constructor, the one before being deprecated.
+    # PySide 6.12 deprecates the former constructor.
     where = QPointF(place) if PySide6.__version_info__ >= (6, 12) else place
     entering = QDragEnterEvent(where, action, dropped, buttons, keys)
     QApplication.sendEvent(window, entering)
@@ -216,9 +216,9 @@ def drop(window: QWidget, *paths: Path) -> None:
 
 
 def answer(act: Callable[[QDialog], None]) -> QTimer:
-    """Answer the next dialog that blocks its caller.
+    """Answer the next modal dialog.
 
-    The timer asks every few milliseconds, as long as it is kept by the caller.
+    The timer polls every few milliseconds, as long as the caller keeps it.
     """
     timer = QTimer()
 
@@ -234,7 +234,7 @@ def answer(act: Callable[[QDialog], None]) -> QTimer:
 
 
 def name_field(dialog: QDialog) -> QLineEdit:
-    """Return where a dialog that asks for a file has its name."""
+    """Return the name field of a file dialog."""
     assert isinstance(dialog, QFileDialog)
     field = dialog.findChild(QLineEdit, "fileNameEdit")
     assert isinstance(field, QLineEdit)
@@ -242,13 +242,13 @@ def name_field(dialog: QDialog) -> QLineEdit:
 
 
 def choose_file(dialog: QDialog, path: Path) -> None:
-    """Name a file in the dialog that asks for one, and accept."""
+    """Enter a file name in a file dialog, and accept."""
     name_field(dialog).setText(str(path))
     dialog.accept()
 
 
 def accept_and_choose(path: Path, timers: list[QTimer]) -> Callable[[QDialog], None]:
-    """Return what accepts a form, and chooses a file in the dialog that follows."""
+    """Return a function that accepts a form and chooses a file in the dialog that follows."""
 
     def accept(dialog: QDialog) -> None:
         timers.append(answer(partial(choose_file, path=path)))
@@ -258,7 +258,7 @@ def accept_and_choose(path: Path, timers: list[QTimer]) -> Callable[[QDialog], N
 
 
 def take_picture(window: QWidget, name: str) -> None:
-    """Save what the screen shows of a window."""
+    """Save a screenshot of a window."""
     QApplication.processEvents()
     SHOTS.mkdir(parents=True, exist_ok=True)
     corner = window.mapToGlobal(QPoint(0, 0))

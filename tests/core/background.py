@@ -1,4 +1,4 @@
-"""What goes on beside a test, and how much memory a call takes."""
+"""Background threads of a test, and the memory of a call."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Callable
 
 
 def peak_memory(work: Callable[[], object]) -> int:
-    """Return the most bytes that a call held at a time beyond those held before it.
+    """Return the peak memory of a call, in bytes, beyond that held before it.
 
-    Where tracing of memory ends while another thread allocates, CPython before 3.12.9 may crash.
-    The tables of bodies that earlier tests opened are waited for; while any other thread lives,
-    tracing goes on.
+    CPython before 3.12.9 may crash if memory tracing stops while another thread allocates. So wait
+    for the tables of bodies that earlier tests opened, and leave tracing on while any other thread
+    is alive.
     """
     for thread in threading.enumerate():
         if thread.name == "uncounted nodes":

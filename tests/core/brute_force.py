@@ -1,9 +1,9 @@
 """Slow references that share nothing with the code under test.
 
-They know neither trees nor boxes nor the eleven axes of the closed form. All rest on the
-Minkowski difference of two triangles, the hull of nine points, and on one fact: its depth at the
-origin is the smallest value of its support function over the unit normals of all planes through
-three of the points, as the facets' normals are among these and no direction gives less.
+They use neither trees nor boxes nor the eleven axes of the closed form, but the Minkowski
+difference of two triangles, the hull of nine points. Its depth at the origin is the smallest value
+of its support function over the unit normals of all planes through three of the points: these
+include the facets' normals, and no direction gives less.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TRIPLES = list(itertools.combinations(range(9), 3))
 
 
 def exact_depth(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
-    """Return the depth of two triangles (3, 3), computed without rounding but the last root."""
+    """Return the penetration depth of two triangles (3, 3), exact but for the last root."""
     return exact_depth_and_direction(a, b)[0]
 
 
@@ -41,7 +41,7 @@ def exact_depth_and_direction(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[float
         if length_squared == 0:
             continue
         along = [n[0] * p[0] + n[1] * p[1] + n[2] * p[2] for p in points]
-        # To part the triangles, move a against n past the highest point, or along n.
+        # To separate the triangles, move a against n past the highest point, or along n.
         for support, sign in ((max(along), -1), (-min(along), 1)):
             if support <= 0:
                 return 0.0, np.zeros(3)
@@ -56,7 +56,7 @@ def exact_depth_and_direction(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[float
 
 
 def _integers(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[list, list, Fraction]:
-    """Write the corners as whole numbers of one length, which they are without rounding."""
+    """Return the corners as integers in a common unit, without rounding."""
     exact = [[[Fraction(float(x)) for x in corner] for corner in np.asarray(t)] for t in (a, b)]
     parts = max(x.denominator for triangle in exact for corner in triangle for x in corner)
     first, second = [[[int(x * parts) for x in corner] for corner in t] for t in exact]
@@ -64,7 +64,7 @@ def _integers(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[list, list, Fraction]
 
 
 def _root(value: Fraction) -> float:
-    """Root of a rational whose square may be outside the range of floats."""
+    """Return the root of a rational that may be outside the range of floats."""
     bits = value.numerator.bit_length() - value.denominator.bit_length()
     shift = 128 - bits
     shift += shift % 2
@@ -101,7 +101,7 @@ def all_pairs(vertices: npt.ArrayLike, faces: npt.ArrayLike, tolerance: float) -
     ----------
     vertices : (V, 3) array
     faces : (F, 3) integer array
-    tolerance : depth up to which a pair is left out, in the unit of `vertices`
+    tolerance : depth up to which a pair is omitted, in the unit of `vertices`
     """
     corners_of = np.asarray(faces)
     points = np.asarray(vertices, dtype=np.float64)
@@ -132,11 +132,11 @@ def all_pairs(vertices: npt.ArrayLike, faces: npt.ArrayLike, tolerance: float) -
 
 
 def _straddles(planes: FloatArray, points: FloatArray, faces: npt.NDArray) -> npt.NDArray[np.bool_]:
-    """(R, F) whether face f is not wholly on one side of the plane of triangle r, with slack."""
+    """(R, F) whether face f is not entirely on one side of the plane of triangle r, with slack."""
     normals = np.cross(planes[:, 1] - planes[:, 0], planes[:, 2] - planes[:, 0])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
-    # The slack keeps pairs that rounding could take away; `depths` decides on them.
+    # The slack keeps pairs that rounding could remove; `depths` decides on them.
     slack = 1e-12 * max(float(np.ptp(points, axis=0).max()), float(np.abs(points).max()))
     heights = normals @ points.T - np.einsum("rc,rc->r", normals, planes[:, 0])[:, None]
     above = (heights > -slack)[:, faces].any(axis=2)
@@ -165,10 +165,10 @@ def depths(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def exact_distance(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
-    """Return the distance of two triangles (3, 3), computed without rounding but the last root.
+    """Return the distance of two triangles (3, 3), exact but for the last root.
 
-    The nearest places are the least of a convex square, so that they are where its derivative is 0
-    with some of the weights of the corners left out: all choices are tried, in fractions.
+    The squared distance is a convex function of the corners' weights, so at its minimum its
+    derivative is 0 with some weights fixed at 0: all choices are tried, in fractions.
     """
     first, second, unit_length = _integers(a, b)
     best: Fraction | None = None
@@ -194,7 +194,7 @@ def exact_distance(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
 
 
 def _least(origin: list, ways: list) -> list[Fraction] | None:
-    """Return the weights of ways that lead nearest to 0 from a place; None if not unique."""
+    """Return the weights of `ways` whose sum with `origin` is nearest to 0; None if not unique."""
     rows = [
         [Fraction(sum(u[c] * v[c] for c in range(3))) for v in ways]
         + [Fraction(-sum(u[c] * origin[c] for c in range(3)))]
@@ -215,7 +215,7 @@ def _least(origin: list, ways: list) -> list[Fraction] | None:
 def distances(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the distances (P,) of triangles a and b (P, 3, 3), in floating point.
 
-    As `exact_distance`: all choices of corners whose weights are not 0 are tried.
+    As in `exact_distance`, all choices of corners with non-zero weights are tried.
     """
     squared = np.full(len(a), np.inf)
     supports = [s for n in (1, 2, 3) for s in itertools.combinations(range(3), n)]
@@ -227,7 +227,7 @@ def distances(a: FloatArray, b: FloatArray) -> FloatArray:
             squared = np.minimum(squared, (origin**2).sum(axis=1))
             continue
         if len(ways) > 3:
-            continue  # They cross: some edge then pierces a face, which is a choice of its own.
+            continue  # They cross: then some edge pierces a face, which is another choice.
         across = np.stack(ways, axis=2)
         left, stretch, right = np.linalg.svd(across, full_matrices=False)
         inverse = np.divide(1.0, stretch, out=np.full_like(stretch, np.nan), where=stretch > 1e-12)
@@ -244,10 +244,10 @@ def distances(a: FloatArray, b: FloatArray) -> FloatArray:
 def signed_distances(
     vertices: npt.ArrayLike, faces: npt.NDArray[np.int32], bound: float
 ) -> ReferencePairs:
-    """Return all pairs without a common vertex that are nearer than a bound, and how far apart.
+    """Return all pairs without a common vertex that are nearer than a bound, and their distances.
 
-    Where two faces penetrate by more than 1e-9, minus the depth. The bound, and what is returned,
-    is in the unit of `vertices`.
+    If two faces penetrate by more than 1e-9, the distance is minus the depth. The bound and the
+    distances are in the unit of `vertices`.
     """
     triangles = np.asarray(vertices, dtype=np.float64)[faces]
     low, high = triangles.min(axis=1), triangles.max(axis=1)

@@ -1,4 +1,4 @@
-"""A small character's file, with all that exports have to keep."""
+"""A small character's file with everything that exports must keep."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PNG = _picture()
 def figure() -> GltfBuilder:
     """Build a skinned tube with seams, one of two parts inside it, a hat, a camera and textures.
 
-    As Mixamo's characters through Blender: meshes and joints hang on an armature of scale 0.01.
+    As in Mixamo's characters from Blender, meshes and joints hang on an armature of scale 0.01.
     """
     builder = GltfBuilder()
     builder.view(np.arange(5, dtype=np.uint8))
@@ -69,7 +69,7 @@ def figure() -> GltfBuilder:
     )
     builder.add("nodes", name="Armature", children=[1, 4, 5], scale=[0.01] * 3)
     builder.description["nodes"][0]["rotation"] = rotation(0, np.pi / 2)
-    # In the armature the tube goes along -z.
+    # In the armature's coordinates, the tube extends along -z.
     builder.add("nodes", name="LeftArm", children=[2], translation=[0.0, 0.0, -50.0])
     builder.add(
         "nodes",

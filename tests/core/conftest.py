@@ -1,4 +1,4 @@
-"""A small model."""
+"""Fixtures of a small model."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def tube_poses() -> PoseSet:
 
 @pytest.fixture(scope="session")
 def tube_model() -> LearnedBody:
-    """Return a model of them with two domains of three codes."""
+    """Return a model of these poses with two domains of three codes."""
     return stored("tube")
 
 
 @pytest.fixture(scope="session")
 def tube_folds(tube_model: LearnedBody) -> np.ndarray:
-    """Return the sites where its skin folds."""
+    """Return the sites where the tube's skin folds."""
     from lcollision_core.predictor.geometric_network import find_fold_sites
 
     return find_fold_sites(tube_model.embedding, colliding_latent(tube_model))

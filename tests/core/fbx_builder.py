@@ -1,4 +1,4 @@
-"""Writes small FBX files, as text, and asks ufbx itself for their frames."""
+"""Writes small FBX files as text, and evaluates their frames with ufbx."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lcollision_core.files import Character
 from tests.core.gltf_builder import tube
 
 TICKS = 46186158000
-"""FBX's unit of time, per second."""
+"""Ticks per second, FBX's unit of time."""
 
 _REFERENCE = """
 import ctypes, gc, io, json, os, sys
@@ -55,7 +55,7 @@ os._exit(0)
 
 
 def ufbx_frames(path: Path, clip: int | None, times: Sequence[float]) -> np.ndarray:
-    """Return the (N, W, 3) vertices that ufbx itself evaluates, meshes in the order of nodes.
+    """Return the (N, W, 3) vertices evaluated by ufbx, meshes in the order of nodes.
 
     Parameters
     ----------
@@ -98,16 +98,16 @@ def arm_fbx(
     path : a .fbx file
     up : 0, 1 or 2
     metres : the unit
-    is_long : whether the file says that the clip lasts as long as its curves, else that it is empty
-    skinning : Linear, Rigid, DualQuaternion or Blend, of the upper vertices more
-    others : names of further meshes, which nothing moves: "hidden ..." are not seen, and each
-        "level ..." is one of a group of levels of detail
+    is_long : whether the clip's stated length is that of its curves, else 0
+    skinning : Linear, Rigid, DualQuaternion, or Blend, which varies towards the upper vertices
+    others : names of further, unmoved meshes: "hidden ..." are invisible, "level ..." are levels
+        of detail of one group
     """
     vertices, faces = tube()
     corners = faces.copy()
     corners[:, 2] = ~corners[:, 2]
     upper = np.clip((vertices[:, 1] - 1.0) / 1.0, 0.0, 1.0).astype(float)
-    # What neither bone moves follows the mesh.
+    # Vertices that neither bone moves follow the mesh.
     shares = {
         "Lower": (np.flatnonzero((upper < 1.0) & (vertices[:, 1] > 0.0)), 1.0 - upper),
         "Upper": (np.flatnonzero(upper > 0.0), upper),
@@ -242,15 +242,15 @@ def arm_fbx(
 def character_fbx(
     character: Character, path: Path, *, texture: str = "", stretched: str = ""
 ) -> Path:
-    """Write a character that is z up, in centimetres, with its rig and its clips' turns.
+    """Write a character, z up, in centimetres, with its rig and its clips' turns.
 
-    Its first half of faces is of the material "Red", the others of "Painted"; texture coordinates
+    The first half of its faces has the material "Red", the rest "Painted"; texture coordinates
     have a seam at x = 0, and each face has its own normal.
 
     Parameters
     ----------
     texture : the name of an image beside the file, for "Painted"
-    stretched : the name of a joint of scale 1.5 along z, which does not reach those below it
+    stretched : the name of a joint with scale 1.5 along z, which its children do not inherit
     """
     rig = character.rig
     assert rig is not None
@@ -378,7 +378,7 @@ def _write(
     up: int,
     metres: float,
 ) -> Path:
-    """Write a file of objects, and of links between them and to their properties."""
+    """Write a file of objects, and of connections between them and to their properties."""
     front, right = (up + 1) % 3, (up + 2) % 3
     connected = [f'    C: "OO",{link}' for link in links]
     connected += [f'    C: "OP",{link}' for link in properties]

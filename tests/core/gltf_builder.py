@@ -27,7 +27,7 @@ class GltfBuilder:
         }
 
     def add(self, kind: str, **values: Any) -> int:
-        """Append an object to a list of the description and return its number."""
+        """Append an object to a list of the description and return its index."""
         self.description.setdefault(kind, []).append(values)
         return len(self.description[kind]) - 1
 
@@ -57,11 +57,11 @@ class GltfBuilder:
         )
 
     def matrices(self, values: np.ndarray) -> int:
-        """Store (n, 4, 4) matrices, column by column."""
+        """Store (n, 4, 4) matrices in column-major order."""
         return self.array(np.asarray(values).transpose(0, 2, 1).reshape(-1, 16))
 
     def animation(self, name: str, *channels: dict[str, Any]) -> None:
-        """Add an animation of channels: node, path, times, values and perhaps interpolation."""
+        """Add an animation with channels of node, path, times, values and maybe interpolation."""
         samplers = [
             {
                 "input": self.array(channel["times"]),
@@ -103,7 +103,7 @@ class GltfBuilder:
 
 
 def tube(n_rings: int = 7, n_sides: int = 6, height: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (V, 3) vertices and (F, 3) faces of a closed tube along y, outwards."""
+    """Return the (V, 3) vertices and (F, 3) faces of a closed tube along y, oriented outwards."""
     angle = 2.0 * np.pi * np.arange(n_sides) / n_sides
     rings = [
         np.stack([np.sin(angle) * 0.4, np.full(n_sides, y), np.cos(angle) * 0.4], axis=1)
@@ -125,12 +125,12 @@ def tube(n_rings: int = 7, n_sides: int = 6, height: float = 3.0) -> tuple[np.nd
 
 
 def split_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give every triangle vertices of its own."""
+    """Give every triangle its own vertices."""
     return vertices[faces.reshape(-1)], np.arange(faces.size).reshape(-1, 3)
 
 
 def rotation(axis: int, angle: float) -> list[float]:
-    """Return the quaternion x, y, z, w about an axis."""
+    """Return the quaternion (x, y, z, w) of a rotation about an axis."""
     result = [0.0, 0.0, 0.0, float(np.cos(angle / 2.0))]
     result[axis] = float(np.sin(angle / 2.0))
     return result

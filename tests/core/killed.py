@@ -1,14 +1,14 @@
-"""Code for processes that are killed or interrupted at a place that is the same each time."""
+"""Code for processes that are killed or interrupted at a reproducible point."""
 
 from __future__ import annotations
 
 
 def after_checkpoint(number: int, signal: str = "SIGKILL") -> str:
-    """Return code after which a process keeps checkpoints as often as it may, and is then stopped.
+    """Return code that makes a process write checkpoints as often as possible and then stops it.
 
     Parameters
     ----------
-    number : the signal comes when so many have been written
+    number : of checkpoints after which the signal is sent
     signal : its name
     """
     return (

@@ -1,4 +1,4 @@
-"""What the tests of labels share."""
+"""Helpers of label tests."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ def labeller_of(model: LearnedBody) -> Labeller:
 
 
 def as_bytes(rows: LabelRows) -> dict[str, bytes]:
-    """Return every column's bytes: rows are the same when these are."""
+    """Return every column's bytes, to compare rows exactly."""
     return {field.name: getattr(rows, field.name).tobytes() for field in fields(rows)}
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
-    """Return what a folder's files hold, by name."""
+    """Return the contents of a folder's files, by name."""
     return {file.name: file.read_bytes() for file in folder.iterdir()}

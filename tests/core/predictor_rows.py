@@ -18,7 +18,7 @@ QUICK = replace(PAPER, batch_rows=64, epochs=4, average_passes=0.0)
 
 
 def made_up_rows(embedding: Embedding, n_rows: int = N_ROWS, seed: int = 1) -> LabelRows:
-    """Draw latents of which those collide whose first code is over a third of a unit."""
+    """Draw latents; those whose first code exceeds a third of a unit count as colliding."""
     rng = np.random.default_rng(seed)
     latent = rng.uniform(-1.0, 1.0, (n_rows, embedding.latent_size)).astype(np.float32)
     depth = np.maximum(latent[:, 0] - 1.0 / 3.0, 0.0).astype(np.float64)
@@ -40,7 +40,7 @@ def colliding_latent(model: LearnedBody, n_poses: int = 60) -> np.ndarray:
 
 
 def weights_of(section_arrays: dict[str, np.ndarray]) -> bytes:
-    """Return all weights' bytes: predictors are the same when these are."""
+    """Return all weights' bytes, to compare predictors exactly."""
     return b"".join(section_arrays[name].tobytes() for name in sorted(section_arrays))
 
 

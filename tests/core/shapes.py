@@ -1,4 +1,4 @@
-"""Meshes whose self-collisions are known from their construction."""
+"""Meshes with self-collisions that are known by construction."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Mesh(NamedTuple):
 
 
 def join(*meshes: Mesh) -> Mesh:
-    """Put meshes side by side into one, faces and vertices in the order given."""
+    """Concatenate meshes into one, faces and vertices in the order given."""
     counts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
     faces = [mesh.faces + count for mesh, count in zip(meshes, counts, strict=False)]
     return Mesh(
@@ -95,8 +95,8 @@ def tube(
 ) -> Mesh:
     """Sweep a regular polygon inside a circle of `radius` along a closed curve (N, 3).
 
-    Its surface stays within `radius` of the curve where the curve's points are dense.
-    `up` is nowhere parallel to the curve.
+    Its surface stays within `radius` of the curve if the curve's points are dense.
+    `up` must be nowhere parallel to the curve.
     """
     tangents = np.roll(centres, -1, axis=0) - np.roll(centres, 1, axis=0)
     across = np.cross(tangents, up)
@@ -125,20 +125,20 @@ def torus(major: float, minor: float, rings: int = 32, sides: int = 10) -> Mesh:
 
 
 def interlocked_tori(minor: float) -> Mesh:
-    """Link two tori of major radius 1 whose centre circles are at distance 1 from each other."""
+    """Link two tori of major radius 1 whose centre circles are 1 apart."""
     other = torus(1.0, minor)
     upright = np.stack([other.vertices[:, 0], other.vertices[:, 2], -other.vertices[:, 1]], axis=1)
     return join(torus(1.0, minor), Mesh(upright, other.faces).moved([1.0, 0.0, 0.0]))
 
 
 def figure_eight(radius: float, lift: float) -> Mesh:
-    """Make a tube along an 8 whose two passes cross at the distance 2 `lift` above each other."""
+    """Make a tube along an 8 whose two passes cross at a vertical distance of 2 `lift`."""
     t = 2 * np.pi * (np.arange(64) + 0.5) / 64
     return tube(np.stack([np.sin(2 * t), 2 * np.sin(t), lift * np.cos(t)], axis=1), radius)
 
 
 def sphere(radius: float = 1.0, n: int = 12) -> Mesh:
-    """Make a sphere of n meridians: a closed lattice with a fan at either pole."""
+    """Make a sphere of n meridians: a closed lattice with a fan at each pole."""
     heights = np.linspace(-np.pi / 2, np.pi / 2, n // 2 + 1)[1:-1]
     angles = 2 * np.pi * np.arange(n) / n
     rings = np.stack(

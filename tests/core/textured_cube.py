@@ -1,4 +1,4 @@
-"""A cube of two joints whose faces have vertices of their own, for tests of how files look."""
+"""A cube of two joints whose faces have their own vertices, for tests of appearance."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _SIDES = ((2, 1.0), (2, -1.0), (0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0))
 
 
 def cube() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (24, 3) vertices from -1 to 1, (12, 3) faces outwards, and (24, 2) coordinates.
+    """Return (24, 3) vertices from -1 to 1, (12, 3) faces outwards, and their (24, 2) UVs.
 
-    On each face the coordinates go from the upper left corner, seen from outside, to the lower
+    On each face, the UVs run from the upper left corner, seen from outside, to the lower
     right one.
     """
     vertices, faces = [], []
@@ -34,7 +34,7 @@ def cube() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def png(pixels: Any, kind: str = "PNG", **options: Any) -> bytes:
-    """Return the file of an image of (H, W, 3) or (H, W, 4) pixels."""
+    """Return the bytes of an image file of (H, W, 3) or (H, W, 4) pixels."""
     out = io.BytesIO()
     Image.fromarray(np.asarray(pixels, dtype=np.uint8)).save(out, format=kind, **options)
     return out.getvalue()
@@ -50,8 +50,8 @@ def textured_cube(
     Parameters
     ----------
     material : of the file; None for none
-    builder : has what the material and the attributes name; None for nothing
-    attributes : accessors by their names, as TEXCOORD_1=3
+    builder : contains what the material and the attributes refer to; None for a new one
+    attributes : accessors by name, as TEXCOORD_1=3
     """
     builder = GltfBuilder() if builder is None else builder
     vertices, faces, uv = cube()
@@ -80,7 +80,7 @@ def textured_cube(
 
 
 def add_texture(builder: GltfBuilder, image: bytes, sampler: dict[str, int] | None = None) -> int:
-    """Add an image that the file holds, and return its texture."""
+    """Add an embedded image, and return its texture."""
     view = builder.view(np.frombuffer(image, dtype=np.uint8))
     texture = {"source": builder.add("images", bufferView=view, mimeType="image/png")}
     if sampler is not None:
@@ -89,6 +89,6 @@ def add_texture(builder: GltfBuilder, image: bytes, sampler: dict[str, int] | No
 
 
 def coloured(**base: Any) -> dict[str, Any]:
-    """Return a material that no light changes, with a base colour."""
+    """Return an unlit material with a base colour."""
     extensions: dict[str, Any] = {"KHR_materials_unlit": {}}
     return {"name": "Skin", "pbrMetallicRoughness": base, "extensions": extensions}

@@ -1,4 +1,4 @@
-"""VTK's reader of glTF, the reference for what a file shows."""
+"""VTK's glTF reader, a reference for the content of files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def vtk_corners(path: Path, clip: int | None = None, time: float = 0.0) -> np.nd
     clip : number of the animation; None for the stored pose
     time : in seconds
     """
-    # It warns of extensions for materials.
+    # VTK warns of material extensions.
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
     reader = vtkGLTFReader()
     reader.SetFileName(str(path))

@@ -573,7 +573,7 @@ class Rigged:
         return np.array([self.armature.data.bones[name].length for name in self.bones])
 
     def baked_copy(self) -> "Rigged":
-        """Copy the armature, as shown, and everything that follows it, without constraints.
+        """Copy the armature, as shown, and what follows it, without constraints and drivers.
 
         The copy is linked to the same collections; the original is hidden, in renders too.
         """

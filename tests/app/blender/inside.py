@@ -1,4 +1,4 @@
-"""What tests do inside Blender: each function is a task, which returns JSON."""
+"""Tasks that tests run inside Blender: each function is one, and returns JSON."""
 
 import json
 import math
@@ -14,7 +14,7 @@ from mathutils import Matrix, Vector
 
 
 def load(path, clip=None, fps=30):
-    """Import a file by Blender's own importer; its character is active, its clips are silent."""
+    """Import a file with Blender's own importer; make its character active, mute its clips."""
     scene = bpy.context.scene
     scene.render.fps = fps
     bpy.ops.import_scene.gltf(filepath=path)
@@ -52,7 +52,7 @@ def meshes_of(armature, props=False):
 
 
 def world_points(armature, props=False):
-    """Return the evaluated vertices in the world, by Blender alone."""
+    """Return the evaluated vertices in world coordinates, as given by Blender."""
     graph = bpy.context.evaluated_depsgraph_get()
     points = []
     for item in meshes_of(armature, props):
@@ -72,7 +72,7 @@ def triangles(armature, props=False):
 
 
 def groups_of(armature, props=False):
-    """Return the name of the bone that has most of each vertex."""
+    """Return the name of the bone with the largest weight at each vertex."""
     names = []
     for item in meshes_of(armature, props):
         for vertex in item.data.vertices:
@@ -103,7 +103,7 @@ def settings():
 
 
 def told():
-    """Return what the panel says."""
+    """Return the panel's content."""
     one = settings()
     return {"verdict": one.verdict, "details": one.details.split("\n"), "off_rig": one.off_rig}
 
@@ -203,7 +203,7 @@ def every_frame(armature, last):
 
 
 def resolve_action(path, clip, n_frames, folder):
-    """Check an action, resolve it, and undo; the points of all frames go into files."""
+    """Check an action, resolve it, and undo; write the points of all frames to files."""
     armature = load(path, clip)
     n_frames, scene = int(n_frames), bpy.context.scene
     old = armature.animation_data.action
@@ -246,7 +246,7 @@ def resolve_action(path, clip, n_frames, folder):
 
 
 def held_by(armature, kind):
-    """Let an empty hold the left arm; return a function that leads it into the trunk or out."""
+    """Let an empty hold the left arm; return a function that moves it into the trunk or out."""
     target = bpy.data.objects.new("target", None)
     bpy.context.collection.objects.link(target)
     target.rotation_mode = "QUATERNION"
@@ -270,7 +270,7 @@ def held_by(armature, kind):
 
 
 def constrained(path, kind):
-    """Resolve a pose and an action that a constraint makes."""
+    """Resolve a pose and an action that result from a constraint."""
     armature = load(path)
     turn = held_by(armature, kind)
     turn(105.0)
@@ -439,7 +439,7 @@ def several_meshes(path):
 
 
 def carried(armature, name, bone, centre, sides):
-    """Parent a box to a bone, in the rest pose; say where it is and how long in the world."""
+    """Parent a box to a bone, in the rest pose, given its position and sides in the world."""
     mesh = bpy.data.meshes.new(name)
     corners = [[(at >> axis & 1) - 0.5 for axis in range(3)] for at in range(8)]
     faces = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
@@ -454,7 +454,7 @@ def carried(armature, name, bone, centre, sides):
 
 
 def carried_meshes(path):
-    """Check and resolve with a staff in a hand and a hat that bones carry, and leave them out."""
+    """Check and resolve with a staff and a hat that bones carry, with and without them."""
     armature = load(path)
     hand = armature.matrix_world @ armature.pose.bones["LeftHand"].bone.matrix_local
     palm = hand @ Vector((0.0, 0.05, 0.0))
@@ -488,7 +488,7 @@ def carried_meshes(path):
     assert bpy.ops.lcollision.resolve_pose("EXEC_DEFAULT", True) == {"FINISHED"}
     answer |= {"resolved": told(), "after": seen(armature)}
     assert bpy.ops.ed.undo() == {"FINISHED"}
-    # The same where a copy is written, with a prop that is not checked and one that is no mesh.
+    # The same when a copy is written, with an unchecked prop and one that is not a mesh.
     armature = next(item for item in bpy.data.objects if item.type == "ARMATURE")
     armature.pose.bones["Head"].constraints.new("LIMIT_ROTATION")
     bpy.data.objects["Hat"].lcollision_is_checked = False
@@ -513,8 +513,8 @@ def carried_meshes(path):
 
 
 def mirror(mesh):
-    """Leave the left half of a mesh, and show the other by a modifier after the armature."""
-    # Only there once `bpy` is.
+    """Keep the left half of a mesh, and show the other by a modifier after the armature."""
+    # Available only after `bpy`.
     import bmesh
 
     half = bmesh.new()
@@ -525,13 +525,13 @@ def mirror(mesh):
     )
     half.to_mesh(mesh.data)
     half.free()
-    # A hand that came to the plane would be merged with the other one.
+    # Otherwise, a hand that reaches the plane would be merged with the other one.
     mesh.modifiers.new("Mirror", "MIRROR").use_mirror_merge = False
     bpy.context.view_layer.update()
 
 
 def moved_besides(path):
-    """Resolve, once and again, what modifiers and bones move otherwise than turns alone do."""
+    """Resolve, twice, a mesh that modifiers and bones move by more than turns."""
     answer = {}
     for kind in ("Subdivision", "Smooth", "Mirror", "Preserve Volume", "scaled", "not inherited"):
         bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
@@ -569,7 +569,7 @@ def moved_besides(path):
 
 
 def forest(path):
-    """Resolve where an arm hangs on a control, and where limbs and trunk hang on nothing."""
+    """Resolve with an arm parented to a control, and with unparented limbs and trunk."""
     answer = {}
     for kind in ("control", "between", "roots"):
         bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
@@ -622,7 +622,7 @@ def module(name):
 
 
 def looked(seconds=60.0):
-    """Let the live check answer about the newest pose; return the verdict."""
+    """Wait for the live check of the newest pose; return the verdict."""
     until = time.monotonic() + seconds
     while time.monotonic() < until and not module("live").look():
         time.sleep(0.01)
@@ -630,7 +630,7 @@ def looked(seconds=60.0):
 
 
 def live(path, folder):
-    """Pose with the live check on, and let it answer; load a file, and go on."""
+    """Pose with the live check on, and wait for its answers; load a file, and continue."""
     armature = load(path)
     settings().live = True
     verdicts, shown = [], []
@@ -656,7 +656,7 @@ def live(path, folder):
 
 def handlers():
     found = [one.__name__ for one in bpy.app.handlers.depsgraph_update_post]
-    # That which takes back what is not so any more is there always.
+    # The handler that withdraws outdated results is always there.
     found.remove("_on_change")
     return found
 
@@ -681,14 +681,14 @@ def changed_character(path):
     answer["rules"] = rules["ignored"]
     settings().ignored.clear()
     answer["counted"] = looked()
-    # A modifier that changes the number of vertices shown.
+    # This modifier changes the number of shown vertices.
     divided = mesh.modifiers.new("divided", "SUBSURF")
     divided.levels = 1
     bpy.context.view_layer.update()
     answer["divided"] = looked()
     answer["is_on"] = settings().live
     mesh.modifiers.remove(divided)
-    # As many vertices in other places: what Check Pose has opened is what the live check asks of.
+    # The same number of vertices, moved: the live check uses the character that Check Pose opened.
     for vertex in mesh.data.vertices:
         vertex.co *= 1.5
     check()
@@ -703,17 +703,17 @@ def changed_character(path):
 
 
 TOO_WIDE = []
-"""Of what was drawn, what a sidebar of Blender's first width cuts off."""
+"""Drawn texts that a sidebar of Blender's initial width cuts off."""
 
 
 class Recorder:
-    """Takes what a panel draws, as a layout does; sentences of several lines are joined again."""
+    """Records what a panel draws, as a layout does; joins the lines of a sentence."""
 
     def __init__(self, lines, is_sentence=False):
         self._lines, self._is_sentence, self._is_begun = lines, is_sentence, False
 
     def __getattr__(self, name):
-        # Only there once `bpy` is.
+        # Available only after `bpy`.
         import blf
 
         def record(*arguments, **named):
@@ -752,10 +752,10 @@ def panel(path):
     lower_arm(armature)
     check()
     armature.pose.bones["Head"].lock_rotation = (True, True, True)
-    # A group that no bone is called after, and that deforms nothing.
+    # A group without a bone of its name: it deforms nothing.
     (mesh,) = meshes_of(armature)
     sleeve = mesh.vertex_groups.new(name="sleeve")
-    # One that a body part is called after, but for capitals.
+    # A group named like a body part except for capitals.
     mesh.vertex_groups.new(name="torso").add(range(40), 1.0, "REPLACE")
     names = groups_of(armature)
     arm = [at for at, name in enumerate(names) if name in ("LeftArm", "LeftForeArm", "LeftHand")]
@@ -778,7 +778,7 @@ def panel(path):
     item.frame, item.deepest, item.parts = 7, 0.01, "Torso and Left hand"
     settings().use_range = True
     answer["listed"] = drawn("LCOLLISION_PT_panel")
-    # In a mesh that modifiers move, written to a copy, with what one cannot resolve.
+    # A mesh that modifiers move, written to a copy, with collisions that cannot be resolved.
     mesh.modifiers.new("wave", "DISPLACE").strength = 0.01
     held_by(armature, "COPY_ROTATION")(105.0)
     check()
@@ -826,7 +826,7 @@ def locked_and_keyed(path):
 
 
 def cancelled(path, clip):
-    """Begin to resolve an action, and cancel it while the engine works."""
+    """Start resolving an action, and cancel it while the engine works."""
     module = sys.modules["bl_ext.user_default.lcollision.actions"]
     armature = load(path, clip)
     bpy.context.scene.frame_set(3)
@@ -850,7 +850,7 @@ def cancelled(path, clip):
 
 
 def failing(path, clip, kind):
-    """Resolve an action of which the check of the result fails or is cancelled."""
+    """Resolve an action while the check of the result fails or is cancelled."""
     actions, client = module("actions"), module("client")
     armature = load(path, clip)
     if kind == "baked":
@@ -890,7 +890,7 @@ def failing(path, clip, kind):
 
 
 def failing_pose(path, kind):
-    """Resolve a pose of which the check of the result fails, as the engine ends."""
+    """Resolve a pose while the check of the result fails because the engine ends."""
     opened = module("link").Opened
     armature = load(path)
     if kind == "baked":
@@ -944,7 +944,7 @@ def slots(path, clip):
 
 
 class InWindow:
-    """The context of an operator in a window: what a window has is recorded."""
+    """The context of an operator in a window; records its calls."""
 
     def __init__(self):
         self.told, self.timers = [], 0
@@ -969,7 +969,7 @@ class InWindow:
 
 
 def modal(path, clip):
-    """Go through the ticks of an operator as a window does, to its end and to Esc."""
+    """Run the ticks of an operator as a window does, to its end and to Esc."""
     actions = module("actions")
     armature = load(path, clip)
     answer = {}
@@ -997,14 +997,14 @@ def modal(path, clip):
             "action": armature.animation_data.action.name,
             "frame": bpy.context.scene.frame_current,
         }
-    # The engine ends, and the character goes, in the middle.
+    # The engine ends, and the character is removed, midway.
     for name in ("ended", "gone"):
         reports, context = [], InWindow()
         operator = stand_in(actions.LCOLLISION_OT_check_action, reports)
         operator.invoke(context, event("MOUSEMOVE"))
         operator.modal(context, event("TIMER"))
         if name == "ended":
-            # At once, as by a crash.
+            # End it at once, as a crash does.
             module("link").engine().close(0.0)
         else:
             bpy.data.objects.remove(armature)
@@ -1022,7 +1022,7 @@ def modal(path, clip):
 
 
 def stand_in(kind, reports):
-    """Return an operator as a window runs it: its reports are kept."""
+    """Return an operator as a window runs it, and keep its reports."""
 
     def report(self, kinds, text):
         reports.append([*kinds, text])
@@ -1035,7 +1035,7 @@ def event(kind):
 
 
 def hung(path):
-    """Stop the engine's process, so that it never answers, and go on."""
+    """Suspend the engine's process, so that it never answers, and continue."""
     client, operators, started = module("client"), module("operators"), []
     popen = subprocess.Popen
 
@@ -1046,7 +1046,7 @@ def hung(path):
     client.subprocess.Popen = start
     armature = load(path)
     (mesh,) = meshes_of(armature)
-    # More than fits into a pipe that nobody reads.
+    # More data than fits into a pipe that nobody reads.
     mesh.modifiers.new("divided", "SUBSURF")
     lower_arm(armature)
     answer = {"first": check()["verdict"], "said": {}, "ended": []}
@@ -1055,7 +1055,7 @@ def hung(path):
     def stop():
         os.kill(started[-1].pid, signal.SIGSTOP)
 
-    # In a window: a tick returns though there is no answer, and Esc ends it.
+    # In a window, a tick returns without an answer, and Esc ends the operator.
     for kind in (operators.LCOLLISION_OT_check_pose, operators.LCOLLISION_OT_resolve_pose):
         stop()
         reports, context = [], InWindow()
@@ -1085,7 +1085,7 @@ def hung(path):
     after = rotations(armature)
     moved = {name: float(np.abs(np.subtract(after[name], pose[name])).max()) for name in pose}
     answer["moved"] = max(moved.values())
-    # Whoever quits Blender does not wait for the engine, however patient others are.
+    # Quitting Blender does not wait for the engine, whatever the timeout of requests.
     client._PATIENCE = 1e6
     stop()
     module("link").stop()
@@ -1095,7 +1095,7 @@ def hung(path):
 
 
 def modal_pose(path):
-    """Resolve a pose tick by tick; move a bone meanwhile; move none."""
+    """Resolve a pose tick by tick, with and without moving a bone meanwhile."""
     armature = load(path)
     lower_arm(armature)
     answer = {}
@@ -1120,7 +1120,7 @@ def modal_pose(path):
 
 
 def stale(path, clip):
-    """Check a pose; change what is shown in each way, and come back."""
+    """Check a pose; change what is shown in every way, and return."""
     armature, scene = load(path, clip), bpy.context.scene
     other = bpy.data.objects.new("other", None)
     scene.collection.objects.link(other)
@@ -1141,7 +1141,7 @@ def stale(path, clip):
         bpy.ops.ed.undo_push(message="posed")
         check()
         bpy.ops.ed.undo_push(message="checked")
-        # To the same pose, of which the verdict holds, and to another.
+        # Undo to the same pose, for which the verdict holds, and to another.
         bpy.ops.ed.undo()
         answer["kept"] = state()
         bpy.ops.ed.undo()
@@ -1165,7 +1165,7 @@ def stale(path, clip):
         scene = bpy.context.scene
         scene.frame_set(12)
         check()
-        # What changes nothing that is shown.
+        # Changes of nothing that is shown.
         bpy.context.view_layer.update()
         other.location.x += 1.0
         bpy.context.view_layer.update()
@@ -1187,7 +1187,7 @@ def stale(path, clip):
     answer["action"] = settings().verdict
     assert bpy.ops.lcollision.clear() == {"FINISHED"}
     answer["cleared"] = [len(settings().frames), len(bpy.context.scene.timeline_markers)]
-    # The live check greys at once what it is about to look at again.
+    # The live check greys at once what it will check again.
     bpy.context.scene.frame_set(12)
     settings().live = True
     looked()
@@ -1197,7 +1197,7 @@ def stale(path, clip):
     answer["live"] = [len(np.unique(colours, axis=0)), len(np.unique(grey, axis=0))]
     looked()
     answer["live"].append(len(np.unique(module("drawing").colours(), axis=0)))
-    # Its switch says what happens.
+    # Its switch shows its state.
     scenes = [settings().live]
     made = bpy.data.scenes.new("second")
     scenes += [made.lcollision.live, "_on_update" in handlers()]
@@ -1209,14 +1209,14 @@ def stale(path, clip):
     addon_utils.disable("bl_ext.user_default.lcollision")
     addon_utils.enable("bl_ext.user_default.lcollision")
     scenes += [settings().live, "_on_update" in handlers()]
-    # Blender's own loop would call it at once.
+    # Blender's event loop would call it at once.
     module("live")._on_load()
     scenes += [settings().live, "_on_update" in handlers()]
     return answer | {"scenes": scenes}
 
 
 def options(path, clip):
-    """Resolve with what the panel offers."""
+    """Resolve with the panel's options."""
     armature = load(path)
     lower_arm(armature)
     pose = rotations(armature)
@@ -1249,7 +1249,7 @@ def options(path, clip):
     answer["selected"] = [settings().verdict, changed()]
     settings().only_selected = False
     reset()
-    # What is tolerated, and what touches in nearly every pose, does not count.
+    # Tolerated depths, and places that touch in nearly every pose, do not count.
     deepest = float(before["details"][0].split()[1])
     settings().tolerated = deepest + 0.1
     answer["tolerated"] = check()["verdict"]
@@ -1271,7 +1271,7 @@ def options(path, clip):
     answer["ignored"] = check()["verdict"]
     assert bpy.ops.lcollision.count_places() == {"FINISHED"}
     answer["counted"] = check()["verdict"] == before["verdict"]
-    # A range of an action: nothing before it or after it changes.
+    # A range of an action: nothing before or after it changes.
     armature.animation_data.action = action = bpy.data.actions[clip]
     armature.animation_data.action_slot = action.slots[0]
     assert bpy.ops.lcollision.check_action() == {"FINISHED"}
@@ -1289,7 +1289,7 @@ def options(path, clip):
 
 
 def decimated(path):
-    """Check a mesh of which a modifier makes another number of vertices in each pose."""
+    """Check a mesh whose number of vertices a modifier changes in each pose."""
     armature = load(path)
     (mesh,) = meshes_of(armature)
     fewer = mesh.modifiers.new("fewer", "DECIMATE")
@@ -1307,7 +1307,7 @@ def decimated(path):
 
 
 def errors(path):
-    """Ask for what cannot be."""
+    """Request impossible things."""
     answer = {}
 
     def refused(name, operator):
@@ -1331,7 +1331,7 @@ def errors(path):
     refused("no engine", bpy.ops.lcollision.check_pose)
     settled.write_text(text)
     check()
-    # The engine dies, and is started again.
+    # The engine dies and is started again.
     link.engine().close()
     answer["again"] = check()
     module = sys.modules["bl_ext.user_default.lcollision"]
@@ -1346,7 +1346,7 @@ def errors(path):
 
 
 def still(path, folder):
-    """Render a pose before and after, with the faces that the add-on draws, as docs/blender.md."""
+    """Render a pose before and after, with the faces that the add-on draws, for docs/blender.md."""
     drawing = sys.modules["bl_ext.user_default.lcollision.drawing"]
     armature, scene = load(path), bpy.context.scene
     lower_arm(armature)
@@ -1372,7 +1372,7 @@ def still(path, folder):
         corners = drawing.shown()
         mesh = bpy.data.meshes.new(name)
         faces = np.arange(len(corners)).reshape(-1, 3)
-        # A little towards the camera, as the add-on draws over the mesh.
+        # Shift towards the camera, as the add-on draws over the mesh.
         towards = np.array(camera.location) - corners
         mesh.from_pydata((corners + 0.05 * towards).tolist(), [], faces.tolist())
         mesh.materials.append(red)
@@ -1389,7 +1389,7 @@ def resolve():
 
 
 def bones_of_bvh(path):
-    """Return where Blender's own importer has the heads of the bones of a BVH file, by frame."""
+    """Return the bone heads of a BVH file by frame, from Blender's own importer."""
     bpy.ops.import_anim.bvh(filepath=path, frame_start=0, update_scene_duration=True)
     (armature,) = (item for item in bpy.data.objects if item.type == "ARMATURE")
     first, last = map(int, armature.animation_data.action.frame_range)
@@ -1402,7 +1402,7 @@ def bones_of_bvh(path):
 
 
 def main(tasks):
-    """Install the add-on, do one of the tasks, and write what it returns."""
+    """Install the add-on, run one of the tasks, and write its result."""
     archive, answer, task, *arguments = sys.argv[1:]
     bpy.ops.wm.read_factory_settings(use_empty=True)
     installed = bpy.ops.extensions.package_install_files(

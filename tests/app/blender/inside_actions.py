@@ -1,4 +1,4 @@
-"""What tests do with actions inside Blender: see `inside.py`."""
+"""Tasks with actions inside Blender: see `inside.py`."""
 
 import bpy
 import inside
@@ -7,7 +7,7 @@ from mathutils import Matrix, Quaternion, Vector
 
 
 def reported(kind):
-    """Run an operator at once; return its result and what it reports."""
+    """Run an operator at once; return its result and its reports."""
     reports = []
 
     def report(_, levels, text):
@@ -20,7 +20,7 @@ def reported(kind):
 
 
 def spans_of(armature, n_frames, do):
-    """Do something that resolves an action; return its spans and the points before and after."""
+    """Call `do`, which resolves an action; return its spans and the points before and after."""
     actions, tried, scene = inside.module("actions"), set(), bpy.context.scene
     rows_of = actions.Written._rows
 
@@ -51,7 +51,7 @@ def points_of_frames(armature, frames):
 
 
 def sparse_action(path, folder):
-    """Resolve an action of few smooth keys, whose ends are free; save it and open it again."""
+    """Resolve an action of few smooth keys with free ends; save it and open it again."""
     armature, actions = inside.load(path), inside.module("actions")
     bpy.context.scene.frame_start = 1
     bone, other = armature.pose.bones["LeftArm"], armature.pose.bones["Head"]
@@ -89,7 +89,7 @@ def sparse_action(path, folder):
 
 
 def random_curve(random, item):
-    """Give an object a curve of some keys of random kinds."""
+    """Give an object a curve with keys of random kinds."""
     item.animation_data_clear()
     item.keyframe_insert("location", index=0, frame=1)
     (curve,) = inside.module("keys").curves_of(item.animation_data.action, item)
@@ -112,7 +112,7 @@ def random_curve(random, item):
 
 
 def rekeyed(n_curves):
-    """Write other values into spans of random curves; return how far all frames are off."""
+    """Write other values into spans of random curves; return the errors of all frames."""
     rekey, random = inside.module("keys").rekey, np.random.default_rng(5)
     item = bpy.data.objects.new("item", None)
     numbers, answer = list(range(1, 61)), []
@@ -132,7 +132,7 @@ def rekeyed(n_curves):
         rekey([curve], [False], numbers, before, after, [(span, 1e-2) for span in spans])
         curve.update()
         now = np.array([curve.evaluate(frame) for frame in frames])
-        # Beyond the keys that there were, a curve goes on from the outermost.
+        # Beyond the original keys, a curve continues from the outermost.
         first, last = curve.range()
         shown = np.array([first <= frame <= last for frame in frames])
         wanted = np.concatenate([after[span.start : span.stop, 0] for span in spans])
@@ -159,7 +159,7 @@ def swing(armature, frames=((1, 60.0), (6, 105.0), (11, 60.0))):
 
 
 def state(armature):
-    """Return what a resolution that is refused or taken back must leave."""
+    """Return the state that a refused or reverted resolution must leave."""
     action = armature.animation_data.action
     return {
         "action": action.name,
@@ -172,7 +172,7 @@ def state(armature):
 
 
 def refusals(path):
-    """Ask for what would be no verdict on the pose, or could not be written."""
+    """Request checks that would not apply to the pose, and results that cannot be written."""
     armature, actions = inside.load(path), inside.module("actions")
     operators, link = inside.module("operators"), inside.module("link")
     (mesh,) = inside.meshes_of(armature)
@@ -284,7 +284,7 @@ def library(path, folder, constrained):
 
 
 def unkeyable(path):
-    """Resolve actions of which some curves are locked, muted or have a modifier."""
+    """Resolve actions with curves that are locked, muted or have a modifier."""
     armature = inside.load(path)
     actions, curves_of = inside.module("actions"), inside.module("keys").curves_of
     swing(armature)
@@ -298,7 +298,7 @@ def unkeyable(path):
     curves["Neck"][2].mute = True
     noise = curves["RightArm"][1].modifiers.new("NOISE")
     noise.strength, noise.scale = 0.01, 3.0
-    # A cycle is the curve itself where its keys are.
+    # Between its keys, a cycle equals the curve itself.
     curves["LeftArm"][0].modifiers.new("CYCLES")
     old = inside.keys(armature.animation_data.action, armature)
     answer = {"why": inside.module("keys").unkeyable_bones(rigged(), list(range(1, 12)))}
@@ -322,7 +322,7 @@ def half(turn):
 
 
 def mirrored(path):
-    """Resolve an action of a half body, which a modifier mirrors; first it turns half the way."""
+    """Resolve an action of a half body that a modifier mirrors; turn half the way first."""
     armature = inside.load(path)
     inside.mirror(inside.meshes_of(armature)[0])
     swing(armature)
@@ -355,7 +355,7 @@ def mirrored(path):
 
 
 def nothing_turns(path):
-    """Resolve what has every bone locked, with auto-keying."""
+    """Resolve with every bone locked, with auto-keying."""
     armature = inside.load(path)
     swing(armature)
     for bone in armature.pose.bones:
@@ -371,7 +371,7 @@ def nothing_turns(path):
 
 
 def worse(path):
-    """Let what is written be worse: in all frames that collide, in one of a span, or by jumps."""
+    """Make the written result worse: in all colliding frames, in one of a span, or by jumps."""
     armature, actions = inside.load(path), inside.module("actions")
     operators, kind = inside.module("operators"), inside.module("scene").Rigged
     swing(armature, ((1, 60.0), (8, 105.0), (15, 60.0), (60, 60.0), (67, 105.0), (74, 60.0)))
@@ -388,12 +388,12 @@ def worse(path):
         number = bpy.context.scene.frame_current
         if number < 40 and number % 2:
             up = np.array(Matrix.Rotation(0.6, 4, (1.0, 0.0, 0.0)))
-            # Of two turns of a joint the last one counts.
+            # Of two turns of a joint, the last one applies.
             joints, turns = [*joints, right], np.concatenate([turns, up[None]])
         return turn(self, transforms, joints, turns, by_fk)
 
     def read_more_pairs(*arguments):
-        """Say of a frame that is freed that it has a pair more than it had."""
+        """Report one more pair than before for a freed frame."""
         frames = yield from read(*arguments)
         for at, number in enumerate(frames.numbers):
             if number == 8 and frames.found[at]["colliding"]:
@@ -419,7 +419,7 @@ def worse(path):
         ]
         answer[name]["frames"] = [item.frame for item in inside.settings().frames]
 
-    # What a step writes is what matters: further ones only cost time.
+    # One step's result is enough here: further ones only cost time.
     most, actions.MOST_STEPS = actions.MOST_STEPS, 1
     kind.turn, actions.Written._show = turn_deeper, look
     resolve("all")
@@ -437,7 +437,7 @@ def worse(path):
 
 
 def deeper_turn(armature, degrees):
-    """Return the (4, 4) turn of the left arm in its own frame that goes on as `swing` does."""
+    """Return the (4, 4) local turn of the left arm that continues the motion of `swing`."""
     rest = np.array(armature.data.bones["LeftArm"].matrix_local.to_3x3())
     back = armature.matrix_world.inverted().to_3x3() @ Vector((0.0, 1.0, 0.0))
     turn = np.eye(4)

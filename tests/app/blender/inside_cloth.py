@@ -1,4 +1,4 @@
-"""What tests do inside Blender to prepare motions for cloth: see `inside.py`."""
+"""Tasks that prepare motions for cloth inside Blender: see `inside.py`."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 def frames_of(armature, first, last, subframes):
-    """Return the (n, W, 3) vertices in the world in frames and between them, by Blender alone."""
+    """Return the (n, W, 3) world vertices in frames and between them, as given by Blender."""
     found, scene = [], bpy.context.scene
     for at in range((last - first) * (subframes + 1) + 1):
         whole, rest = divmod(at, subframes + 1)
@@ -19,9 +19,9 @@ def frames_of(armature, first, last, subframes):
 
 
 def prepare(path, clip, output, gap, subframes, folder, first="", last=""):
-    """Prepare an action for cloth; the points before and after, and the faces, go into files.
+    """Prepare an action for cloth; write the points before and after, and the faces, to files.
 
-    Where there is no clip, an arm swings down and up again. Without a range all frames are meant.
+    Without a clip, an arm swings down and up again. Without a range, all frames are used.
     """
     armature = inside.load(path, clip or None)
     if not clip:
@@ -57,7 +57,7 @@ def prepare(path, clip, output, gap, subframes, folder, first="", last=""):
 
 
 def refused(path, clip, folder):
-    """Ask for caches without a place for them, then with a bone that takes no keys."""
+    """Request caches without a folder for them, then with a bone that cannot be keyed."""
     armature = inside.load(path, clip)
     settings, kind = inside.settings(), inside.module("cloth").LCOLLISION_OT_prepare_cloth
     settings.cloth_output = "CACHE"

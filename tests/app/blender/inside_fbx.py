@@ -1,4 +1,4 @@
-"""What tests of FBX do inside Blender."""
+"""Tasks of FBX tests inside Blender."""
 
 import json
 
@@ -12,7 +12,7 @@ def exported(body, folder, rates):
 
     Returns
     -------
-    points : of each clip by its name, the world's vertices in each frame, by Blender alone
+    points : world vertices in each frame, by the name of the clip, as given by Blender
     """
     armature, scene, random = inside.load(body), bpy.context.scene, np.random.default_rng(7)
     (mesh,) = inside.meshes_of(armature)
@@ -48,11 +48,11 @@ def exported(body, folder, rates):
             answer[name].append(inside.world_points(armature))
         bpy.ops.export_scene.fbx(
             filepath=f"{folder}/{name}.fbx",
-            # Without what stands for the bones.
+            # Without the objects that display the bones.
             use_selection=True,
             bake_anim_use_all_actions=False,
             bake_anim_use_nla_strips=False,
-            # Keys that are left out as good as lie on a line would be a thousandth off.
+            # Simplified keys would be off by a thousandth.
             bake_anim_simplify_factor=0.0,
         )
     return answer

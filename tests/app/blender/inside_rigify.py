@@ -1,4 +1,4 @@
-"""What tests do with Rigify's human inside Blender: see `inside.py`."""
+"""Tasks with Rigify's human inside Blender: see `inside.py`."""
 
 import math
 import os
@@ -11,7 +11,7 @@ import numpy as np
 from mathutils import Vector
 
 FREE, BELLY = (0.5, -0.1, 1.1), (0.02, -0.03, 1.15)
-"""Places of the left hand beside the trunk and in it."""
+"""Positions of the left hand beside the trunk and in it."""
 
 N_FRAMES = 34
 
@@ -20,7 +20,7 @@ _RADII |= {"upper_arm": 0.045, "forearm": 0.04, "hand": 0.035, "shoulder": 0.05}
 
 
 def human():
-    """Generate Rigify's basic human, with tubes about the bones that deform."""
+    """Generate Rigify's basic human, with tubes around the deforming bones."""
     bpy.ops.preferences.addon_enable(module="rigify")
     bpy.ops.object.armature_basic_human_metarig_add()
     metarig = bpy.context.view_layer.objects.active
@@ -64,7 +64,7 @@ def human():
 
 
 def put_hand(rig, place, frame=None):
-    """Put the target of the left arm's IK somewhere."""
+    """Move the target of the left arm's IK to a position."""
     hand = rig.pose.bones["hand_ik.L"]
     hand.location = (0.0, 0.0, 0.0)
     bpy.context.view_layer.update()
@@ -77,7 +77,7 @@ def put_hand(rig, place, frame=None):
 
 
 def seen(rig):
-    """Return what is shown of the rig, and how it is posed."""
+    """Return the shown rig and its pose."""
     bones = rig.pose.bones
     return {
         "points": inside.world_points(rig),
@@ -94,7 +94,7 @@ def changed(before, after):
 
 
 def pose():
-    """Resolve a pose of the human by its controls; say which joints locks of them lock."""
+    """Resolve a pose of the human by its controls; return the joints that their locks lock."""
     rig = human()
     operators = inside.module("operators")
     answer = {"faces": inside.triangles(rig), "groups": inside.groups_of(rig)}
@@ -113,7 +113,7 @@ def pose():
         "active": bpy.context.view_layer.objects.active is rig,
         "again": inside.check()["verdict"],
     }
-    # With the left arm's controls locked, the arm stays, whatever DEF bones say.
+    # With the left arm's controls locked, the arm stays, whatever the DEF bones' locks.
     for bone in rig.pose.bones:
         bone.matrix_basis.identity()
         if "IK_FK" in bone:

@@ -1,11 +1,11 @@
-"""What tests of shapes do inside Blender."""
+"""Tasks of shape tests inside Blender."""
 
 import bpy
 import inside
 
 
 def played(file, n_frames):
-    """Return the world's vertices of a character in frames of its clip, or as its file poses it."""
+    """Return a character's world vertices in frames of its clip, or in its file's stored pose."""
     scene = bpy.context.scene
     scene.render.fps = 30
     bpy.ops.import_scene.gltf(filepath=file)

@@ -1,7 +1,7 @@
-"""Blender without a window, in a Python of its own, which has its own packages.
+"""Blender without a window, in a separate Python with its own packages.
 
-Its wheel wants NumPy below 2 and one version of Python: `python3.11 -m venv bpyenv`,
-`bpyenv/bin/pip install bpy==5.0.1`, then with LCOLLISION_BPY=bpyenv/bin/python this folder's tests.
+Its wheel needs NumPy below 2 and one version of Python: `python3.11 -m venv bpyenv`,
+`bpyenv/bin/pip install bpy==5.0.1`; run this folder's tests with LCOLLISION_BPY=bpyenv/bin/python.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def python_with_bpy() -> str:
 
 
 def in_blender(folder: Path, task: str, *arguments: object, script: str = "inside.py") -> Any:
-    """Install the add-on in a Blender of its own and run a function of a script there.
+    """Install the add-on in a separate Blender and run a function of a script there.
 
     Parameters
     ----------
@@ -39,14 +39,14 @@ def in_blender(folder: Path, task: str, *arguments: object, script: str = "insid
 
     Returns
     -------
-    told : what the function returned, as JSON
+    told : the function's result, as JSON
     """
     python = python_with_bpy()
     archive, answer = folder / "lcollision.zip", folder / "answer.json"
     archive.write_bytes(addon_zip())
     environment = os.environ | {
         "BLENDER_USER_RESOURCES": str(folder / "user"),
-        # For the engine that the add-on starts, as where it is not installed but checked out.
+        # For the engine that the add-on starts, if it is checked out but not installed.
         "PYTHONPATH": str(ROOT),
     }
     path = Path(__file__).with_name(script)

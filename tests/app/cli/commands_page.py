@@ -1,4 +1,4 @@
-"""Makes docs/commands.md of what `--help` says: python -m tests.app.cli.commands_page > FILE."""
+"""Generate docs/commands.md from `--help`: python -m tests.app.cli.commands_page > FILE."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def page() -> str:
 
 
 def _paths(command: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Give the words of each command that does something, and the command, in order of names."""
+    """Yield the words of each executable command, and the command, in order of names."""
     inner = getattr(command, "commands", None)
     if inner is None:
         yield path, command

@@ -1,4 +1,4 @@
-"""How consistent the rotations of features are."""
+"""Consistency of the rotations of features."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from lcollision_core.meshes import Topology
 
 
 def n_jumps(features: npt.NDArray[np.float64], topology: Topology) -> list[int]:
-    """Count each pose's edges whose angles differ by more than pi, axes pointing the same way."""
+    """Count each pose's edges whose angles differ by more than pi, with axes aligned."""
     logs = features[:, topology.edges.T, :3]
     angles = np.linalg.norm(logs, axis=3)
     signs = np.where((logs[:, 0] * logs[:, 1]).sum(axis=2) < 0.0, -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""The comparison of all modes of the detector with brute force."""
+"""Comparison of all modes of the detector with brute force."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def near_pairs(found: SelfCollisions) -> np.ndarray:
 
 
 def near_penetration_depth(found: SelfCollisions) -> np.ndarray:
-    """Return their (Q,) penetration depths."""
+    """Return the (Q,) penetration depths of `near_pairs`."""
     return found.excluded_depth[found.excluded_rule == NEAR]
 
 

@@ -1,4 +1,4 @@
-"""The check on a GPU against the CPU's; `test_gpu` runs it where numba simulates a GPU."""
+"""The GPU check against the CPU's; `test_gpu` runs it with a GPU simulated by Numba."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _bodies(
 
 
 def _require_equal(detector: CollisionDetector, poses: np.ndarray, unit: float = 1.0) -> int:
-    """Compare what both devices find, and return how many pairs count."""
+    """Compare the results of both devices, and return how many pairs count."""
     choose_device(Device.CPU)
     batch, colliding = detector.detect_batch(poses), detector.are_colliding(poses, unit=unit)
     found = [detector.detect(pose) for pose in poses]
@@ -117,7 +117,7 @@ def test_auto_takes_a_gpu_for_what_is_worth_it_and_says_so(
     expected = detector.are_colliding(poses)
     assert not notes
     monkeypatch.setattr(devices, "_WORTHWHILE", 100)
-    # In any layout.
+    # Any memory layout is accepted.
     flipped = np.asfortranarray(poses.astype(np.float64))
     assert np.array_equal(detector.are_colliding(flipped), expected)
     assert np.array_equal(detector.are_colliding(poses[:1]), expected[:1])

@@ -8,7 +8,7 @@ from tests.core.shapes import Mesh
 
 
 def strip(n_columns: int) -> Mesh:
-    """Make a flat strip along x, two vertices wide, one unit a column."""
+    """Make a flat strip along x, two vertices wide, one unit per column."""
     vertices = [[float(x), float(y), 0.0] for x in range(n_columns) for y in range(2)]
     faces = []
     for x in range(n_columns - 1):

@@ -1,4 +1,4 @@
-"""One model, and rows of it that were labelled without store, threads or chunks."""
+"""One model, and rows of it labelled without store, threads or chunks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def ground_truth(labeller: Labeller) -> LabelRows:
 
 @pytest.fixture(scope="session")
 def finished(labeller: Labeller, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a store of these rows, which no test may change."""
+    """Return a store of these rows that no test may change."""
     path = tmp_path_factory.mktemp("finished") / "store"
     label_poses(labeller, path, N_ROWS, seed=SEED)
     assert LabelStore.open(path).n_rows == N_ROWS

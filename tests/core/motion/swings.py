@@ -26,12 +26,12 @@ def swinging_body(
 ) -> Character:
     """Return a character with the clips `CLIP`, in which its left arm swings down, and `OTHER`.
 
-    The arm is 60 degrees down at first and at last, and runs into the trunk in the middle.
+    The arm is 60 degrees down at the start and at the end, and in the trunk in the middle.
 
     Parameters
     ----------
-    n_swings : down and up again, in all
-    begin : how much of a swing is over at first
+    n_swings : number of swings down and up again
+    begin : the fraction of a swing at which it starts
     travel : metres that it walks to its left
     """
     body = rigged_body()
@@ -80,7 +80,7 @@ def swinging() -> tuple[RigBody, Motion]:
 
 @cache
 def through_the_trunk() -> tuple[RigBody, Motion]:
-    """Return the body, and a motion whose arm is before the trunk up to frame 13, then behind."""
+    """Return the body, and a motion whose arm jumps from before to behind the trunk at frame 13."""
     body, _ = swinging()
     rig = body.character.rig
     assert rig is not None

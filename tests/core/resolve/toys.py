@@ -1,4 +1,4 @@
-"""Small problems whose answers are known, for the tests of Resolve."""
+"""Small problems with known solutions, for the tests of Resolve."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lcollision_core.resolve.problem import CollisionModel, Deadline, ResolvePro
 
 @dataclass(eq=False)
 class HalfSpace:
-    """Calls a pose free where normal . Z <= offset; counts the batches that it is asked for."""
+    """Calls a pose free if normal . Z <= offset; counts the batches."""
 
     normal: FloatArray
     offset: float
@@ -26,10 +26,10 @@ class HalfSpace:
 
 @dataclass(eq=False)
 class Ball:
-    """Calls a pose free outside of a ball (sign 1) or inside of it (sign -1).
+    """Calls a pose free outside a ball (sign 1) or inside it (sign -1).
 
-    The logit is smooth but at the centre; beyond `plateau` from the centre, where one is given, it
-    is a plateau without a slope, as far as a solver can tell.
+    The logit is smooth except at the centre; beyond the distance `plateau` from it, if given, it is
+    numerically flat.
     """
 
     centre: FloatArray
@@ -55,7 +55,7 @@ def toy_problem(
     deadline: Deadline | None = None,
     code_weights: FloatArray | None = None,
 ) -> ResolveProblem:
-    """Make the problem with the plain distance, within `bound` of 0."""
+    """Make the problem with the Euclidean distance, within `bound` of 0."""
     size = len(target)
     return ResolveProblem(
         target=target,

@@ -1,4 +1,4 @@
-"""Engines to talk to, and a character as a client has it."""
+"""Engine processes, and a character as a client sends it."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ ROOT = Path(__file__).parents[3]
 
 
 def start(**options: Any) -> Engine:
-    """Start the engine of this checkout as a process of its own."""
+    """Start the engine of this checkout as a separate process."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     return Engine.start([sys.executable, "-m", "app"], env=environment, **options)
 
 
 def as_arrays(character: Character) -> Reply:
-    """Return the fields of `open_mesh` of a character made here."""
+    """Return the `open_mesh` fields of a synthetic character."""
     rig = character.rig
     assert rig is not None
     part = {
@@ -43,5 +43,5 @@ def as_arrays(character: Character) -> Reply:
 
 
 def array(values: Reply) -> Any:
-    """Return an array of a reply."""
+    """Return an array from a reply."""
     return np.frombuffer(values["data"], values["dtype"]).reshape(values["shape"])
