@@ -1,4 +1,4 @@
-"""Latent codes to energy per domain and collision probability: learned, smooth, fast (stage 2)."""
+"""Predict energies per domain and collision probability from latent codes (stage 2)."""
 
 from lcollision_core.predictor.config import (
     PRESETS,

@@ -1,4 +1,4 @@
-"""How a predictor is trained: its configuration, the split of its rows, the files of its course."""
+"""Training of a predictor: its configuration, the split of its rows, its files."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ Loss = Literal["full", "no-rank", "no-depth", "entropy"]
 Schedule = Literal["constant", "one-cycle"]
 
 LEAST_PASSES = 6
-"""Over any number of rows, where `shown_rows` shortens a training."""
+"""Least number of passes if `shown_rows` shortens a training."""
 
 
 @dataclass(frozen=True)
 class PredictorConfig:
-    """How a collision predictor is trained.
+    """Options for training a collision predictor.
 
     Attributes
     ----------
-    preset : names the network, see `presets.NETWORKS`
+    preset : name of the network, see `presets.NETWORKS`
     by_domain : whether there is a predictor for each domain; False is the paper's baseline ND
-    depth_weight, rank_weight, entropy_weight : of L_PD, L_rank, L_entropy; the entropy's is over
+    depth_weight, rank_weight, entropy_weight : of L_PD, L_rank, L_entropy; the entropy's is above
         0; the default preset has its own losses, without ranking
     rate : Adam's step size; the largest one with the schedule "one-cycle"
     schedule : "constant", or "one-cycle": up to `rate` in the first fifth of the steps, then down
         to 0, along cosines
     batch_rows : rows per step, of all processes together; even, for the ranking loss's pairs
     epochs : passes over the training rows, see `passes`
-    shown_rows : where not None, passes over many rows end when so many have been shown
-    average_passes : time constant, in passes, of the exponential mean of the weights that is
-        watched and kept in their place; 0 takes them as they are
+    shown_rows : number of rows to show in all, which shortens training on many rows; or None
+    average_passes : time constant, in passes, of the exponential mean of the weights, which is
+        evaluated and stored in their place; 0 uses the weights themselves
     balanced : whether the logit is shifted so that false positive and false negative rates are
         about equal, see `balanced_logit`
 
     Raises
     ------
-    LCollisionError : a value is out of its range.
+    LCollisionError : a value is out of range.
     """
 
     preset: str = "default"
@@ -80,7 +80,7 @@ class PredictorConfig:
 
         Raises
         ------
-        LCollisionError : the preset's loss is another, without these terms.
+        LCollisionError : the preset's loss lacks these terms.
         """
         if loss != "full" and self.preset != "paper":
             raise LCollisionError(
@@ -106,23 +106,24 @@ PRESETS = {
         shown_rows=2_800_000,
         balanced=True,
     ),
-    # Its constant rate never lets the weights settle, and it overfits long before
-    # the last pass; a long mean helps against both. The paper does not say which weights it kept.
+    # With a constant rate the weights never settle, and the network overfits long before the last
+    # pass; a long mean helps against both. The paper does not say which weights it kept.
     "paper": PredictorConfig("paper", average_passes=8.0),
 }
-"""The presets by name: what measures best, and Tan et al. 2021, section Evaluation."""
+"""The presets by name: the best by measurement, and Tan et al. 2021, section Evaluation."""
 
 
 _EVERY = 10
 """Every n-th held-out row chooses the decision threshold."""
 
 LEAST_BALANCING = 5000
-"""Fewer rows do not choose a decision threshold: their noise would cost more than the gain."""
+"""Least number of rows to choose a decision threshold: the noise of fewer costs more than the
+gain."""
 
 
 @dataclass(frozen=True, eq=False)
 class RowSplit:
-    """Which rows do what: three int64 arrays of indices, ascending, no row in two of them.
+    """The roles of rows: three disjoint, ascending int64 arrays of indices.
 
     Attributes
     ----------
@@ -139,7 +140,7 @@ class RowSplit:
 def split_rows(n_rows: int, config: PredictorConfig, draws: Draws = Draws.BOX) -> RowSplit:
     """Split the samples 0, 1, ... of a store, drawn in one way.
 
-    The decision threshold is chosen by a tenth of the rows that would measure, if these are many.
+    If there are many held-out rows, a tenth of them choose the decision threshold.
     """
     is_out = measures(np.arange(n_rows), draws)
     rest, held_out = np.flatnonzero(~is_out), np.flatnonzero(is_out)
@@ -152,14 +153,14 @@ def split_rows(n_rows: int, config: PredictorConfig, draws: Draws = Draws.BOX) -
 def held_out_index(
     n_rows: int, config: PredictorConfig, n_given: int, draws: Draws = Draws.BOX
 ) -> npt.NDArray[np.int64]:
-    """Return the ascending numbers of the rows that neither trained nor chose anything.
+    """Return the ascending indices of the rows that neither trained nor chose the threshold.
 
     Parameters
     ----------
-    n_rows : samples 0, 1, 2, ... of its store; fewer or more than it was given
-    config : how it was trained
-    n_given : how many rows of the store it was given, those held out among them
-    draws : what the store's samples are drawn from
+    n_rows : number of rows of the store now
+    config : how the predictor was trained
+    n_given : number of rows that the training was given, including held-out ones
+    draws : how the store's samples are drawn
     """
     held_out = np.flatnonzero(measures(np.arange(n_rows), draws))
     return np.setdiff1d(held_out, split_rows(n_given, config, draws).validation)
@@ -171,11 +172,11 @@ class PredictorStatus:
 
     Attributes
     ----------
-    epoch, epochs : passes over the rows, finished and in all
+    epoch, epochs : passes over the rows, finished and in total
     done, total : steps of the whole run
     loss : mean over the steps of this epoch so far, None before the first
     held_out_errors : false positive and false negative rate on some held-out rows after the last
-        epoch; None before that, and where no row is of the kind
+        epoch; None before that, and if a class has no rows
     preparing : fraction of the training rows whose patches are labelled; None once training began
     """
 
@@ -189,10 +190,10 @@ class PredictorStatus:
 
 
 def patches_path(checkpoint: Path) -> Path:
-    """Return the file beside a checkpoint that keeps the labelled patches."""
+    """Return the file beside a checkpoint that stores the labelled patches."""
     return checkpoint.with_name(f"{checkpoint.name}.patches")
 
 
 def has_begun(checkpoint: Path) -> bool:
-    """Whether a stopped run goes on from a checkpoint, or at least from its patches."""
+    """Whether a stopped run has left a checkpoint, or at least its patches."""
     return checkpoint.exists() or patches_path(checkpoint).exists()

@@ -1,4 +1,4 @@
-"""A predictor's answers beside exact labels, and the scores that follow from them."""
+"""Score a predictor's answers against exact labels."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ _ROWS_PER_REPORT = 50 * BATCH_ROWS
 
 @dataclass(frozen=True)
 class PartScores:
-    """How well a domain's predicted energy S_k tells where a pose collides.
+    """Scores of a domain's predicted energy S_k as an indicator of its collisions.
 
     Attributes
     ----------
-    domain : its number, from 0
-    colliding : rows in which the domain has a penetration energy above 0
-    auc : area under the ROC curve of S_k against that; None where one class is missing
-    average_precision : area under the curve of precision by recall; None likewise
-    spearman : rank correlation of predicted and true energy over those rows, None without
+    domain : its index, from 0
+    colliding : number of rows in which the domain has a penetration energy above 0
+    auc : area under the ROC curve of S_k for those rows; None if one class is missing
+    average_precision : area under the precision-recall curve; None likewise
+    spearman : rank correlation of predicted and true energy over those rows; None if undefined
     """
 
     domain: int
@@ -53,10 +53,10 @@ class ScoredRows:
 
     Attributes
     ----------
-    predictor : that answered
+    predictor : that gave the answers
     rows : the labels
     domain_energy : (B, K) float64 array, scaled S_k, also below 0; (B, 1) without domains
-    logit : (B,) float64 array, of the collision probability
+    logit : (B,) float64 array, logit of the collision probability
     """
 
     predictor: CollisionPredictor
@@ -71,16 +71,16 @@ class ScoredRows:
         return probability
 
     def called(self, threshold: float = 0.5) -> npt.NDArray[np.bool_]:
-        """(B,) which rows have a probability above the decision threshold."""
+        """(B,) whether each row's probability is above the decision threshold."""
         called: npt.NDArray[np.bool_] = self.probability > threshold
         return called
 
     def counts(self, threshold: float = 0.5) -> Counts:
-        """Count the right and the wrong verdicts."""
+        """Count correct and wrong verdicts."""
         return Counts.of(self.called(threshold), self.rows.colliding)
 
     def metrics(self, threshold: float = 0.5) -> PredictorMetrics:
-        """Return the scores that a model file keeps."""
+        """Return the scores that a model file stores."""
         config, facts = self.predictor.config, self.predictor.facts
         metrics = measure(
             self.probability,
@@ -96,7 +96,7 @@ class ScoredRows:
 
     @property
     def auc(self) -> float | None:
-        """The area under the ROC curve, None where one class is missing."""
+        """The area under the ROC curve, None if one class is missing."""
         return area_under_roc(self.logit, self.rows.colliding)
 
     def parts(self) -> tuple[PartScores, ...]:
@@ -130,8 +130,8 @@ def score_rows(
     Parameters
     ----------
     predictor : of the model that the rows label
-    rows : at least one, none of which trained the predictor
-    job : reports rows, and is polled every few thousand of them
+    rows : at least one, none used to train the predictor
+    job : reports rows; polled every few thousand rows
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Scores of a predictor, with their intervals, and how certain a prediction is."""
+"""Scores of a predictor, with confidence intervals, and the ranges where it is sure."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from scipy.special import betaincinv, ndtri
 from lcollision_core.meshes.topology import FloatArray
 
 ERROR_BOUNDS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
-"""Shares of wrong verdicts for which it is known where the predictor is sure."""
+"""Shares of wrong verdicts for which the predictor's sure range is stored."""
 
 _CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
 class SureRange:
-    """Where estimates may stand for the exact check.
+    """The logits at which estimates may replace the exact check.
 
     Attributes
     ----------
-    error_bound : with a confidence of 95 %, no larger share of all samples is judged wrongly
+    error_bound : with 95 % confidence, at most this share of all samples is judged wrongly
     free_below, colliding_above : logits; a pose between them is not judged
     coverage : share of the samples that are judged
     """
@@ -46,17 +46,17 @@ def sure_ranges(
     Selective classification with a guaranteed risk (Geifman and El-Yaniv 2017). The limits are
     equally far from the decision threshold at 0: then ranges are nested, and the rows that choose
     one also confirm it (Bates et al. 2021, Distribution-Free, Risk-Controlling Prediction Sets).
-    Limits chosen for each side would need other rows to confirm them. Of calibrated logits no other
-    limits judge more with as few errors (Chow 1970).
+    Limits chosen for each side would need other rows to confirm them. If logits are calibrated, no
+    other limits judge more samples with as few errors (Chow 1970).
 
     Parameters
     ----------
-    logit : (B,) of samples that did not train the predictor, drawn independently
+    logit : (B,) of independent samples that did not train the predictor
     colliding : (B,) bool array, ground truth
-    error_bounds : ascending; those that so few samples cannot confirm are left out
+    error_bounds : ascending; bounds that so few samples cannot confirm are left out
     """
     distance = np.abs(logit)
-    # The limit that lets k samples be judged wrongly is the distance of the next such one.
+    # With k mistakes allowed, the limit is the distance of the next wrongly judged sample.
     limits = np.append(-np.sort(-distance[(logit > 0.0) != colliding]), 0.0)
     ranges = []
     for bound in error_bounds:
@@ -68,9 +68,10 @@ def sure_ranges(
 
 
 def _most_errors(n_samples: int, bound: float) -> int | None:
-    """Return how many errors among the samples still confirm a bound; None if even 0 do not.
+    """Return the largest number of errors that still confirms a bound; None if even 0 does not.
 
-    By the upper end of the interval of Clopper and Pearson (1934), which grows with the errors.
+    It uses the upper end of the interval of Clopper and Pearson (1934), which grows with the
+    errors.
     """
     confirmed, refuted = -1, int(bound * n_samples) + 1
     while refuted - confirmed > 1:
@@ -85,7 +86,7 @@ def _most_errors(n_samples: int, bound: float) -> int | None:
 CALIBRATION_BINS = 10
 
 CONFIDENCE = 0.95
-"""Of the intervals."""
+"""Confidence of the intervals."""
 
 _PAIRING_SEED = 0
 """Seed of the pairs of RANK, so that equal predictions get equal scores."""
@@ -97,9 +98,9 @@ class CalibrationBin:
 
     Attributes
     ----------
-    samples : how many
+    samples : number of poses
     probability : their mean prediction, None without samples
-    colliding_share : how many of them collide, None without samples
+    colliding_share : share of them that collides, None without samples
     """
 
     samples: int
@@ -114,22 +115,22 @@ _Rate = Annotated[float, Meta(ge=0.0, le=1.0)]
 class PredictorMetrics:
     """Scores over samples that did not train the predictor; rates are fractions from 0 to 1.
 
-    None stands for what the samples or the losses trained on leave undefined.
+    Scores that the samples or the trained losses leave undefined are None.
 
     Attributes
     ----------
-    samples : how many
+    samples : number of samples
     accuracy : CLASSIFY, fraction of correct decisions at probability 0.5
-    false_positive_rate : free poses called colliding
-    false_negative_rate : colliding poses called free
-    majority_rate : accuracy of always answering what is more frequent
+    false_positive_rate : fraction of free poses called colliding
+    false_negative_rate : fraction of colliding poses called free
+    majority_rate : accuracy of always answering the more frequent class
     energy_mse : MSE of PDe-sum, in scaled energies
     ranking_margin : RANK, mean of max(0, alpha - sign dS_sum) over random pairs of unequal
         PDe-sum, in scaled energies
     spearman : rank correlation of predicted and true PDe-sum over colliding samples
     calibration_error : expected calibration error over `calibration`
     calibration : the curve, `CALIBRATION_BINS` equal bins of the predicted probability
-    sure : where estimates may stand for the exact check, by error bound
+    sure : ranges where estimates may replace the exact check, by error bound
     """
 
     samples: Annotated[int, Meta(ge=1)]
@@ -149,7 +150,7 @@ class PredictorMetrics:
 
 @dataclass(frozen=True)
 class Counts:
-    """Verdicts beside the ground truth; "positive" means colliding.
+    """Confusion matrix of verdicts; "positive" means colliding.
 
     Attributes
     ----------
@@ -163,13 +164,13 @@ class Counts:
 
     @classmethod
     def of(cls, called: npt.NDArray[np.bool_], colliding: npt.NDArray[np.bool_]) -> Counts:
-        """Count (B,) verdicts beside the ground truth."""
+        """Count (B,) verdicts against the ground truth."""
         pairs = ((called, colliding), (called, ~colliding), (~called, ~colliding))
         return cls(*(int((a & b).sum()) for a, b in (*pairs, (~called, colliding))))
 
     @property
     def shares(self) -> dict[str, tuple[int, int]]:
-        """Each rate by name, as how many of how many."""
+        """Each rate by name, as (count, total)."""
         hits, alarms = self.true_positives, self.false_positives
         passed, missed = self.true_negatives, self.false_negatives
         return {
@@ -183,14 +184,14 @@ class Counts:
 
 @dataclass(frozen=True)
 class KindScores:
-    """How a predictor judges poses of one kind, see `PoseKind`; rates are fractions from 0 to 1.
+    """Scores on poses of one kind, see `PoseKind`; rates are fractions from 0 to 1.
 
     Attributes
     ----------
     kind : of the poses
-    samples : how many
-    colliding_share : of these
-    accuracy, false_positive_rate, false_negative_rate : as of `PredictorMetrics`
+    samples : number of poses
+    colliding_share : share of them that collides
+    accuracy, false_positive_rate, false_negative_rate : as in `PredictorMetrics`
     """
 
     kind: str
@@ -231,7 +232,7 @@ def measure(
     energy : (B,) PDe-sum, scaled
     margin : alpha, scaled
     threshold : probability above which a pose is called colliding
-    depth, rank : whether L_PD and L_rank were trained: without, what they teach is not scored
+    depth, rank : whether L_PD and L_rank were trained; scores that depend on them are else None
     """
     called, ranked = probability > threshold, depth or rank
     n_colliding = int(colliding.sum())
@@ -263,7 +264,7 @@ def mean_difference(values: FloatArray) -> float:
 def error_rates(
     called: npt.NDArray[np.bool_], colliding: npt.NDArray[np.bool_]
 ) -> tuple[float | None, float | None]:
-    """Return the false positive and the false negative rate; None where no row is of the kind."""
+    """Return the false positive and false negative rates; None for a class without rows."""
     wrong = called != colliding
     return (
         float(wrong[~colliding].mean()) if not colliding.all() else None,
@@ -279,7 +280,7 @@ def _ranking_margin(predicted: FloatArray, energy: FloatArray, margin: float) ->
 
 
 def spearman(predicted: FloatArray, energy: FloatArray) -> float | None:
-    """Return the rank correlation of (B,) values, None where one side has no order."""
+    """Return the rank correlation of (B,) values, None if those of one side are all equal."""
     from scipy.stats import spearmanr
 
     if len(energy) < 2 or np.ptp(predicted) == 0.0 or np.ptp(energy) == 0.0:
@@ -288,7 +289,7 @@ def spearman(predicted: FloatArray, energy: FloatArray) -> float | None:
 
 
 def interval(count: int, total: int) -> tuple[float, float] | None:
-    """Return the interval of a share with `CONFIDENCE` (Clopper and Pearson 1934), None of none."""
+    """Return the interval of a share (Clopper and Pearson 1934), None if the total is 0."""
     if not total:
         return None
     tail = 0.5 * (1.0 - CONFIDENCE)
@@ -314,7 +315,7 @@ def roc_curve(score: FloatArray, positive: npt.NDArray[np.bool_]) -> tuple[Float
 
     Parameters
     ----------
-    score : (B,) higher for what is more likely positive
+    score : (B,) higher for rows that are more likely positive
     positive : (B,) bool array with both classes
 
     Returns
@@ -330,7 +331,7 @@ def roc_curve(score: FloatArray, positive: npt.NDArray[np.bool_]) -> tuple[Float
 
 
 def area_under_roc(score: FloatArray, positive: npt.NDArray[np.bool_]) -> float | None:
-    """Return the area under `roc_curve`, None where one class is missing."""
+    """Return the area under `roc_curve`, None if one class is missing."""
     if positive.all() or not positive.any():
         return None
     by, of = roc_curve(score, positive)
@@ -338,7 +339,7 @@ def area_under_roc(score: FloatArray, positive: npt.NDArray[np.bool_]) -> float 
 
 
 def average_precision(score: FloatArray, positive: npt.NDArray[np.bool_]) -> float | None:
-    """Return the mean precision, weighed by the recall gained; None where one class is missing."""
+    """Return the mean precision, weighted by recall gained; None if one class is missing."""
     if positive.all() or not positive.any():
         return None
     hits, calls = _ranked(score, positive)
@@ -346,7 +347,7 @@ def average_precision(score: FloatArray, positive: npt.NDArray[np.bool_]) -> flo
 
 
 def _ranked(score: FloatArray, positive: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-    """Count the positives and all among the rows down to each different score, highest first."""
+    """Count positives and all rows down to each distinct score, highest first."""
     order = np.argsort(-score, kind="stable")
     last = np.append(np.flatnonzero(np.diff(score[order])), len(score) - 1)
     return positive[order].cumsum()[last].astype(np.float64), last + 1.0

@@ -1,4 +1,4 @@
-"""What the networks of the presets share: latent codes in, scaled energies and one logit out."""
+"""Common parts of the presets' networks: latent codes in, scaled energies and one logit out."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class NetworkOutput(NamedTuple):
     Attributes
     ----------
     domain_energy : (B, K) S_k, scaled, may be below 0; (B, 1) from a network without domains
-    logit : (B,) of the probability of a collision
-    auxiliary : what else the network's own loss needs
+    logit : (B,) logit of the collision probability
+    auxiliary : further outputs that the network's own loss needs
     """
 
     domain_energy: torch.Tensor
@@ -40,8 +40,8 @@ class Targets(NamedTuple):
     ----------
     domain_energy : (B, K) scaled
     energy : (B,) scaled
-    colliding : (B,) 1 where they collide, else 0
-    patch_root : (B, P + S) see `patch_labels`; (B, 0) for a network without patches
+    colliding : (B,) 1 for poses that collide, else 0
+    patch_root : (B, P + S) see `PatchLabeller.roots`; (B, 0) for a network without patches
     """
 
     domain_energy: torch.Tensor
@@ -61,7 +61,7 @@ class SkinCells:
     Attributes
     ----------
     patch : (V,) the patch of each vertex, 0 to P - 1, for contact between parts
-    fold : (V,) the site of each vertex, 0 to S - 1, for folds; all -1 where there are none
+    fold : (V,) the site of each vertex, 0 to S - 1, for folds; all -1 if there are none
     """
 
     patch: npt.NDArray[np.int64]
@@ -81,8 +81,8 @@ class SkinCells:
 class PredictorNetwork(nn.Module, ABC):
     """A preset's network: differentiable from latent codes to energies and a logit.
 
-    Its state dict is all that a model file keeps of it, in float32. `build` must need the training
-    rows only for what the state dict holds.
+    A model file stores only its state dict, in float32. `build` may use the training rows only for
+    values of the state dict.
     """
 
     @classmethod
@@ -100,12 +100,11 @@ class PredictorNetwork(nn.Module, ABC):
 
         Parameters
         ----------
-        embedding : whose latent codes come in
-        config : the choices
-        rows : some of those to train on, as they are in the store; None if a state dict will be
-            loaded
+        embedding : of the latent codes
+        config : how to train
+        rows : some of the training rows, as in the store; None if a state dict will be loaded
         seed : of the initial weights
-        rules, groups : by which the rows were labelled: which pairs of faces do not count
+        rules, groups : the contact rules of the labels, and the groups that they name
         """
 
     @classmethod
@@ -123,7 +122,7 @@ class PredictorNetwork(nn.Module, ABC):
         return network
 
     def skin_cells(self, embedding: Embedding) -> SkinCells | None:  # noqa: ARG002
-        """Divide the skin, for a network that learns patch by patch."""
+        """Divide the skin, if the network learns patch by patch."""
         return None
 
     @abstractmethod
@@ -139,13 +138,13 @@ class PredictorNetwork(nn.Module, ABC):
         config: PredictorConfig,
         margin: float,
     ) -> torch.Tensor:
-        """Sum up this process's share of the batch's mean loss.
+        """Return this process's share of the batch's mean loss.
 
         Parameters
         ----------
         output : for the rows of `part`
         batch : the labels of the whole batch
-        part : first and last + 1 of this process's rows in the batch; the first is even
+        part : start and stop of this process's rows in the batch; the start is even
         config : the terms' weights
         margin : of the ranking loss, scaled
         """
@@ -157,8 +156,8 @@ class StackedLinear(nn.Module):
     Parameters
     ----------
     n_stacked, n_in, n_out : K and the sizes
-    generator : of the initial weights, uniform within 1/sqrt(fan-in) as PyTorch's own
-    fan_in : (K,) inputs that count, where the others are always 0; default `n_in` each
+    generator : of the initial weights, uniform within 1/sqrt(fan-in) like PyTorch's
+    fan_in : (K,) number of inputs that are not always 0, by default `n_in` each
     """
 
     def __init__(
@@ -183,7 +182,7 @@ class StackedLinear(nn.Module):
 
 
 class SeededLinear(nn.Module):
-    """A linear layer whose initial weights come from a generator, uniform as PyTorch's own.
+    """A linear layer whose initial weights come from a generator, uniform like PyTorch's.
 
     Parameters
     ----------

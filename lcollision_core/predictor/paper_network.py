@@ -1,6 +1,6 @@
-"""The network and the losses of the paper, by torch.
+"""The network and the losses of the paper, with torch.
 
-Each returns a value for every row or pair, not yet averaged: processes that share a batch divide
+Each loss returns a value for every row or pair, not averaged: processes that share a batch divide
 their sums by the whole batch's count. Energies are scaled: divided by the mean PDe-sum of the
 colliding training rows.
 """
@@ -36,12 +36,12 @@ from lcollision_core.predictor.stored_network import (
 def depth_loss(
     predicted: torch.Tensor, domain_energy: torch.Tensor, energy: torch.Tensor
 ) -> torch.Tensor:
-    """L_PD: squared error of each domain's energy, and absolute error of their sum.
+    """Return L_PD: the squared error of each domain's energy plus the absolute error of their sum.
 
     Parameters
     ----------
-    predicted : (B, K) S_k; K may be 1 where there is no domain but the whole
-    domain_energy : (B, K) mask-weighted sums of PDe, or (B, 0) to leave the first term out (ND)
+    predicted : (B, K) S_k; K is 1 without domains
+    domain_energy : (B, K) mask-weighted sums of PDe, or (B, 0) to leave out the first term (ND)
     energy : (B,) PDe-sum
 
     Returns
@@ -55,9 +55,9 @@ def depth_loss(
 
 
 def rank_loss(predicted_energy: torch.Tensor, energy: torch.Tensor, margin: float) -> torch.Tensor:
-    """L_rank: by how much two rows' predicted energies fall short of their right order.
+    """Return L_rank: the shortfall of two rows' predicted energies from their correct order.
 
-    Rows 0 and 1, 2 and 3 and so on form pairs; the rows come shuffled.
+    Rows 0 and 1, 2 and 3 and so on form pairs; the rows are shuffled.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def rank_loss(predicted_energy: torch.Tensor, energy: torch.Tensor, margin: floa
 
     Returns
     -------
-    losses : (B // 2,), 0 for pairs of equal energy: the paper defines none for them
+    losses : (B // 2,), 0 for pairs of equal energy, for which the paper defines none
     """
     n_pairs = len(energy) // 2
     true_lead = energy[1 : 2 * n_pairs : 2] - energy[0 : 2 * n_pairs : 2]
@@ -86,8 +86,8 @@ class PaperNetwork(PredictorNetwork):
     """CSE, one CP for each domain and the classifier, in the paper's sizes, with ReLU.
 
     S_0 = CSE(Z_all); S_k = CP_k(S_0, Z_k); logit = MLP(S_1, ..., S_K). Without domains (ND) one
-    head on S_0 gives S_sum, and the classifier reads that alone. Tan et al. 2021, sections
-    "Collision Detection Architecture" and "Evaluation".
+    head on S_0 gives S_sum, the only input of the classifier. Tan et al. 2021, sections "Collision
+    Detection Architecture" and "Evaluation".
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ class PaperNetwork(PredictorNetwork):
         rules: ContactRules = STRICT,  # noqa: ARG003
         groups: Sequence[FaceGroup] = (),  # noqa: ARG003
     ) -> PredictorNetwork:
-        """Make the network of an embedding; the rows do not matter."""
+        """Make the network of an embedding; rows, rules and groups are not used."""
         return cls(embedding.group_sizes, config.by_domain, seed)
 
     def forward(self, latent: torch.Tensor) -> NetworkOutput:
@@ -161,7 +161,7 @@ class PaperNetwork(PredictorNetwork):
         config: PredictorConfig,
         margin: float,
     ) -> torch.Tensor:
-        """Sum up this process's share of the batch's mean loss: the paper's three terms."""
+        """Return this process's share of the batch's mean loss: the paper's three terms."""
         own = batch.part(*part)
         n_rows = len(batch.energy)
         total = (
@@ -191,7 +191,7 @@ class PaperNetwork(PredictorNetwork):
 
 
 def _padded_codes(group_sizes: Sequence[int]) -> torch.Tensor:
-    """Return (K, widest) which code of (Z_all, 0) is code j of domain k; past its last, the 0."""
+    """Return (K, widest) indices into (Z_all, 0) of each domain's codes, padded with the 0."""
     latent_size, widest = sum(group_sizes), max(group_sizes[1:])
     index = torch.full((len(group_sizes) - 1, widest), latent_size)
     start = group_sizes[0]

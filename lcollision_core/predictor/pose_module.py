@@ -1,4 +1,4 @@
-"""A learned model as a torch module: codes to vertices, energies and a logit, with derivatives."""
+"""A torch module of a learned model: codes to vertices, energies and a logit, differentiable."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from lcollision_core.predictor.predictor import CollisionPredictor
 
 
 class PoseOutput(NamedTuple):
-    """What a `PoseModule` makes of B poses, on the codes' device and in their precision.
+    """The outputs of a `PoseModule` for B poses, on the codes' device and in their precision.
 
     Attributes
     ----------
     vertices : (B, V, 3), in the model's unit
     domain_energy : (B, K) S_k >= 0, in normalised length squared; (B, 1) without domains
-    collision_logit : (B,) above 0 a pose is called colliding
+    collision_logit : (B,) above 0, a pose is called colliding
     """
 
     vertices: torch.Tensor
@@ -31,7 +31,7 @@ class PoseOutput(NamedTuple):
 
 
 class PoseModule(torch.nn.Module):
-    """A learned model, differentiable by its latent codes, for a loss of yours.
+    """A learned model, differentiable by its latent codes, for use in a loss.
 
     Vertices are those of `LearnedBody.decode`. The decoder is fixed and solves a sparse system on
     the CPU, to which codes of another device are copied; the predictor runs on the module's device.
@@ -39,9 +39,9 @@ class PoseModule(torch.nn.Module):
 
     Parameters
     ----------
-    embedding : decodes
+    embedding : decodes the codes
     predictor : of the embedding
-    unit : length of the model's unit, what a normalised length of 1 is in it
+    unit : a normalised length of 1 in the model's unit
 
     Examples
     --------
@@ -95,14 +95,13 @@ class PoseModule(torch.nn.Module):
         return energy, output.logit + self._logit_shift
 
     def logit(self, latent: torch.Tensor) -> torch.Tensor:
-        """Return the (B,) logits of (B, D) latent codes alone.
+        """Return only the (B,) logits of (B, D) latent codes.
 
-        On the CPU by compiled loops where the preset has them, in double precision and a small part
-        of torch's time.
+        On the CPU, presets with compiled loops take a fraction of torch's time.
 
         Raises
         ------
-        ShapeError : another shape, or on the CPU a number that is not finite.
+        ShapeError : another shape or, on the CPU, a number that is not finite.
         """
         self._require(latent)
         if latent.device.type != "cpu" or self._predictor.needs_torch:
@@ -117,7 +116,7 @@ class PoseModule(torch.nn.Module):
 
 
 class _Decode(torch.autograd.Function):
-    """`Embedding.decode`, and the product of its derivative with the vertices' gradients."""
+    """Differentiable `Embedding.decode`."""
 
     @staticmethod
     def forward(ctx: Any, latent: torch.Tensor, embedding: Embedding) -> torch.Tensor:
@@ -146,7 +145,7 @@ class _Decode(torch.autograd.Function):
 
 
 class _Logit(torch.autograd.Function):
-    """`CollisionPredictor.logit_and_gradient`."""
+    """Differentiable logit, by `CollisionPredictor.logit_and_gradient`."""
 
     @staticmethod
     def forward(ctx: Any, latent: torch.Tensor, predictor: CollisionPredictor) -> torch.Tensor:

@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from lcollision_core.predictor.network_base import PredictorNetwork
 
 BATCH_ROWS = 500
-"""Rows that are predicted at a time: their hidden layers stay in the caches."""
+"""Rows predicted at a time: their hidden layers stay in the caches."""
 
 _ROWS_PER_LOOK = 50 * BATCH_ROWS
 
 _LEAST_ENERGY, _LARGEST_FACT = 1e-18, 1e6
-"""Limits of facts: far beyond what training finds, far from overflow."""
+"""Limits of stored facts, far beyond trained values and far from overflow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +42,10 @@ class Prediction:
     Attributes
     ----------
     domain_energy : (B, K) float64 array, S_k >= 0, in normalised length squared; a predictor
-        without domains spreads its sum over all alike
+        without domains distributes its sum equally
     energy : (B,) float64 array, S_sum, their sum
     collision_logit : (B,) float64 array
-    collision_probability : (B,) float64 array, its sigmoid; over 0.5 the pose is called colliding
+    collision_probability : (B,) float64 array, its sigmoid; above 0.5 the pose is called colliding
     """
 
     domain_energy: FloatArray
@@ -56,18 +56,18 @@ class Prediction:
 
 @dataclass(frozen=True)
 class TrainingFacts:
-    """What a predictor was trained on.
+    """Facts about the data that a predictor was trained on.
 
     Attributes
     ----------
-    rows : M, labelled rows given, those held out among them
-    training_rows : of them, that trained
-    colliding_share : of all rows that are of the latent box
+    rows : M, number of labelled rows, including held-out ones
+    training_rows : number of rows that trained
+    colliding_share : share of colliding rows among those of the latent box
     seed : of the initial weights and the order
     energy_scale : mean PDe-sum of the colliding training rows, in normalised length squared;
         energies are divided by it
     margin : alpha of the ranking loss, scaled
-    store : what the rows label, None if they came without a store
+    store : identity of the rows' store, None if they came without one
     logit_shift : added to the network's logit, which makes 0 the decision threshold
     """
 
@@ -87,14 +87,14 @@ class TrainingFacts:
 
 @dataclass(frozen=True)
 class PredictorRecord:
-    """Metadata of a predictor beside the weights.
+    """Metadata of a predictor besides the weights.
 
     Attributes
     ----------
     config : how it was trained
-    facts : what it was trained on
-    metrics : measured on held-out rows, None before they are
-    kinds : scores on poses of several kinds, where they were measured
+    facts : about its training data
+    metrics : measured on held-out rows, None before
+    kinds : scores on poses of several kinds, if measured
     """
 
     config: PredictorConfig
@@ -104,7 +104,7 @@ class PredictorRecord:
 
     @classmethod
     def of_section(cls, section: Section, embedding: Embedding) -> PredictorRecord:
-        """Read the record, and check the weights beside it, without torch.
+        """Read the record and check the weights, without torch.
 
         Parameters
         ----------
@@ -139,20 +139,20 @@ class PredictorRecord:
 
 @dataclass(frozen=True, eq=False)
 class CollisionPredictor:
-    """Predicts energy per domain and collision from latent codes.
+    """Predict energies per domain and collision from latent codes.
 
-    Immutable, and safe to share between threads. Made by `train_predictor` or `from_section`. The
+    Immutable and safe to share between threads. Made by `train_predictor` or `from_section`. The
     default preset computes in single precision on the CPU, where it needs no torch.
 
     Attributes
     ----------
-    embedding : whose latent codes come in
+    embedding : of the latent codes
     arrays : the network's state dict
     config : how it was trained
-    facts : what it was trained on
-    metrics : measured on held-out rows, None before they are
-    kinds : scores on poses of several kinds, where they were measured
-    device : that is to predict, "cpu" or "cuda"
+    facts : about its training data
+    metrics : measured on held-out rows, None before
+    kinds : scores on poses of several kinds, if measured
+    device : "cpu" or "cuda"
     """
 
     embedding: Embedding
@@ -197,12 +197,12 @@ class CollisionPredictor:
         Parameters
         ----------
         latent : (B, D) finite array
-        error_bound : share of wrong verdicts among poses drawn as those that measured it, > 0; the
-            next smaller one of `ERROR_BOUNDS` is kept
+        error_bound : > 0, share of wrong verdicts among poses of the distribution on which it was
+            measured; the next smaller one of `ERROR_BOUNDS` is used
 
         Returns
         -------
-        free, colliding : (B,) bool arrays; neither holds for a pose that needs the exact check
+        free, colliding : (B,) bool arrays; both False for a pose that needs the exact check
 
         Raises
         ------
@@ -216,7 +216,7 @@ class CollisionPredictor:
         return logit < kept[-1].free_below, logit > kept[-1].colliding_above
 
     def scaled_outputs(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
-        """Return the network's outputs: scaled energies, also below 0, and the shifted logit.
+        """Return the network's outputs: scaled energies, maybe below 0, and the shifted logit.
 
         Parameters
         ----------
@@ -237,7 +237,7 @@ class CollisionPredictor:
         return domain_energy, logit + self.facts.logit_shift
 
     def _torch_outputs(self, codes: npt.NDArray[np.float32]) -> tuple[FloatArray, FloatArray]:
-        """Return the network's own scaled energies and logits, by torch."""
+        """Return the network's scaled energies and unshifted logits, by torch."""
         import torch
 
         with torch.inference_mode():
@@ -264,7 +264,7 @@ class CollisionPredictor:
         ------
         ShapeError : another shape, or a number that is not finite.
         """
-        # Never read-only: the loops would be compiled for that, too.
+        # A writable copy: Numba would compile its loops again for read-only arrays.
         poses = np.array(self._checked(latent), dtype=np.float64)
         if self._compiled is not None:
             logit, gradient = self._compiled.logit_and_gradient(poses)
@@ -273,7 +273,7 @@ class CollisionPredictor:
         return logit + self.facts.logit_shift, gradient
 
     def _differentiated(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the network's own logits and their gradients, by torch."""
+        """Return the network's unshifted logits and their gradients, by torch."""
         import torch
 
         codes = torch.tensor(poses, device=self.device)
@@ -304,7 +304,7 @@ class CollisionPredictor:
 
     @classmethod
     def from_section(cls, section: Section, embedding: Embedding) -> CollisionPredictor:
-        """Rebuild a predictor from what `to_section` gave.
+        """Rebuild a predictor from the section of `to_section`.
 
         Parameters
         ----------
@@ -337,7 +337,7 @@ class CollisionPredictor:
         return CompiledNetwork(self.embedding, self.arrays)
 
     def network(self) -> PredictorNetwork:
-        """Make the torch network anew, in single precision on the CPU, its weights fixed."""
+        """Return a new torch network in single precision on the CPU, with fixed weights."""
         import torch
 
         from lcollision_core.predictor.presets import NETWORKS
@@ -369,11 +369,11 @@ class CollisionPredictor:
 
 
 def require_model(rows: LabelRows, embedding: Embedding) -> None:
-    """Refuse rows of another latent space, or with a number that is not finite.
+    """Check that rows are of the embedding's latent space, and finite.
 
     Raises
     ------
-    ShapeError : as said, naming the first row that is wrong.
+    ShapeError : another latent space, or a number that is not finite; names the first such row.
     """
     n_domains, latent_size = rows.domain_energy.shape[1], rows.latent.shape[1]
     if (n_domains, latent_size) != (embedding.n_domains, embedding.latent_size):

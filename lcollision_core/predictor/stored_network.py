@@ -1,7 +1,7 @@
-"""Checks the arrays of a trained network in a model file, without building the network.
+"""Check the arrays of a trained network in a model file, without building the network.
 
-Building one needs geometry of the body's surface, and the paper's needs torch; both wait until the
-first prediction. The arrays are checked before that.
+Building a network needs geometry of the body's surface, and the paper's needs torch; both wait
+until the first prediction. The arrays are checked before that.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ENCODER_SIZES = (512, 256, 256)
 PREDICTOR_SIZES = (512, 256, 256, 128)
 CLASSIFIER_SIZE = 64
 UNDIVIDED_SIZE = 128
-"""The paper's layers."""
+"""Sizes of the paper's layers."""
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -34,19 +34,19 @@ _INPUTS_PER_FEATURE = 10.0
 
 
 def require_network(arrays: Arrays, embedding: Embedding, preset: str, by_domain: bool) -> None:
-    """Refuse arrays that are not the state dict of a preset's network for an embedding.
+    """Check that arrays are the state dict of a preset's network for an embedding.
 
     Parameters
     ----------
     arrays : of the model file's section
-    embedding : whose codes come in
+    embedding : of the latent codes
     preset : "default" or "paper"
-    by_domain : whether it has a predictor for each domain
+    by_domain : whether the network has a predictor for each domain
 
     Raises
     ------
-    ValueError : an array is missing or one too many, has another type or shape, or holds numbers
-        that would overflow.
+    ValueError : an array is missing or unknown, has another type or shape, or holds numbers that
+        would overflow.
     """
     reader = _Reader(arrays)
     if preset == "paper":
@@ -61,7 +61,7 @@ def require_network(arrays: Arrays, embedding: Embedding, preset: str, by_domain
 
 
 class _Reader:
-    """Takes arrays of a section, and records which."""
+    """Read arrays of a section, and record their names."""
 
     def __init__(self, arrays: Arrays) -> None:
         self._arrays = arrays
@@ -75,7 +75,7 @@ class _Reader:
         return required_array(self._arrays, name, dtype, shape, largest)
 
     def sites(self) -> npt.NDArray[np.int32]:
-        """Take the fold sites, if any."""
+        """Read the fold sites, if any."""
         vertices = self._arrays.get("site_vertices", np.empty(()))
         n_sites = 0 if vertices.ndim == 2 and not len(vertices) else None
         return self.array("site_vertices", n_sites, None, dtype=np.int32)
@@ -83,18 +83,18 @@ class _Reader:
     def layers(
         self, names: Sequence[str], sizes: Sequence[int | None], n: int | None, bound: float
     ) -> float:
-        """Take the layers of n networks, or of one that is not stacked, one after the other.
+        """Read the layers of n stacked networks, or of a single one, in order.
 
         Parameters
         ----------
         names : of the layers
         sizes : of the inputs and of each layer's outputs, None for any
-        n : how many networks are side by side; None for one alone
+        n : number of stacked networks; None for a single one
         bound : of the inputs
 
         Returns
         -------
-        bound : of the outputs, as far as the weights' sizes tell
+        bound : of the outputs, from the sums of absolute weights
         """
         stacked, of_bias = ((), ()) if n is None else ((n,), (n, 1))
         width = sizes[0]
@@ -121,7 +121,7 @@ def _require_default(reader: _Reader, embedding: Embedding) -> None:
     if sites.size and not 0 <= sites.min() <= sites.max() < topology.n_vertices:
         raise ValueError("its array site_vertices names vertices that the body has not")
     decoder = embedding.scaling
-    # Every autoencoder adds at most its scale, as tanh does not exceed 1.
+    # Every autoencoder adds at most its scale, as |tanh| does not exceed 1.
     largest = max(
         abs(centre) + 2.0 * (embedding.n_domains + 2) / scale
         for centre, scale in (

@@ -1,4 +1,4 @@
-"""Train a predictor on labelled samples, and choose its operating point."""
+"""Train a predictor on labelled samples, and choose its decision threshold."""
 
 from __future__ import annotations
 
@@ -26,21 +26,22 @@ from lcollision_core.predictor.predictor import (
 )
 
 _MISTAKES_ADDED = 0.5
-"""Further mistakes allowed, as a fraction of those at even odds."""
+"""Additional mistakes allowed, as a fraction of those at logit 0."""
 
 _ERRORS_APART = 2.0
-"""Rates that differ by fewer standard errors may be the same."""
+"""Number of standard errors up to which two rates may be equal."""
 
 
 def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float:
     """Return the decision threshold: the logit above which poses are called colliding.
 
-    The most accurate classifier misjudges the rarer class more often. Where the false positive and
-    the false negative rate at logit 0 differ by more than chance, the threshold moves towards equal
-    rates as far as at most half as many errors again are expected.
-    What is expected is a logistic curve's through all rows (Platt 1999): counting the few rows near
-    a limit would go where these happen to be favourable. The bound counts mistakes and not calls,
-    for a predictor that errs once in a thousand calls is not to err ten times.
+    The most accurate classifier misjudges the rarer class more often. If the false positive and
+    false negative rates at logit 0 differ significantly, the threshold moves towards equal rates,
+    as long as the expected mistakes grow by at most half.
+
+    Expectations come from a logistic curve through all rows (Platt 1999): counting the few rows
+    near a threshold would favour chance. The bound is on mistakes, not on calls, so that a
+    predictor that errs once in a thousand calls does not err ten times.
 
     Parameters
     ----------
@@ -49,7 +50,7 @@ def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float
 
     Returns
     -------
-    threshold : 0 where one class is missing
+    threshold : 0 if one class is missing
     """
     n_rows, n_colliding = len(logit), int(colliding.sum())
     n_free = n_rows - n_colliding
@@ -62,7 +63,7 @@ def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float
         return 0.0
     ordered = np.sort(logit)
     probability = _calibrated(logit, colliding, ordered)
-    # Between two different neighbours, or at 0: how many lie below says all.
+    # Candidates lie between two different neighbours, or at 0; only the number below counts.
     cuts = 1 + np.flatnonzero(ordered[1:] > ordered[:-1])
     limits = np.append(0.5 * (ordered[cuts] + ordered[cuts - 1]), 0.0)
     n_below = np.append(cuts, np.searchsorted(ordered, 0.0, side="right"))
@@ -76,7 +77,7 @@ def balanced_logit(logit: FloatArray, colliding: npt.NDArray[np.bool_]) -> float
 
 
 def _rate(count: int, total: int) -> tuple[float, float]:
-    """Return a rate and its variance, of none and of all too (Agresti and Coull 1998)."""
+    """Return a rate and its variance, valid at 0 and 1 too (Agresti and Coull 1998)."""
     rate = (count + 2.0) / (total + 4.0)
     return rate, rate * (1.0 - rate) / (total + 4.0)
 
@@ -84,9 +85,9 @@ def _rate(count: int, total: int) -> tuple[float, float]:
 def _calibrated(
     logit: FloatArray, colliding: npt.NDArray[np.bool_], wanted: FloatArray
 ) -> FloatArray:
-    """Return how likely poses of the wanted logits collide, by a logistic curve through the rows.
+    """Return collision probabilities at the wanted logits, by a logistic curve through the rows.
 
-    Platt's targets stay off 0 and 1, so that the curve is one even where a limit divides the rows.
+    Platt's targets avoid 0 and 1, so that the curve stays finite even for separable rows.
     """
     from scipy.optimize import minimize
     from scipy.special import expit
@@ -118,23 +119,23 @@ def train_predictor(
     job: Job = UNWATCHED,
     seed: int = 0,
 ) -> CollisionPredictor:
-    """Train a predictor on labelled samples and measure it on those held out.
+    """Train a predictor on labelled samples and measure it on held-out ones.
 
-    Rows that `measures` holds out never train. A killed run that is started again with the same
-    checkpoint goes on where it was and ends with the same bits, on one machine with one number of
-    threads. Under torchrun every process calls this with the same arguments: they share the
-    labelling of patches and each batch, and all return the same predictor.
+    Rows that `measures` selects never train. A killed run that is started again with the same
+    checkpoint resumes and ends with the same bits, on one machine with the same number of threads.
+    Under torchrun every process calls this with the same arguments: they share the labelling of
+    patches and each batch, and all return the same predictor.
 
     Parameters
     ----------
-    rows : samples 0, 1, 2, ... of a store; at least one free and one colliding one to train on.
-        Where something is chosen, some of them only do that, see `split_rows`.
+    rows : samples 0, 1, 2, ... of a store, with at least one free and one colliding training row.
+        Some may only choose the threshold, see `split_rows`.
     embedding : of the model that the rows label
-    config : the choices, by default the preset "default"
-    store : what the rows label, and by which contact rules; kept with the predictor
-    groups : of faces, of which these rules may ignore pairs
-    device : "cpu", "cuda", or "auto" for CUDA where there is one
-    checkpoint : a file to go on from and to save to; kept when the run ends
+    config : how to train, by default the preset "default"
+    store : identity of the rows' store, with the contact rules; stored with the predictor
+    groups : groups of faces that these rules may name
+    device : "cpu", "cuda", or "auto" for CUDA if there is such a device
+    checkpoint : a file to resume from and to save to; kept when the run ends
     job : reports a `PredictorStatus` every few steps and after every epoch; polled after every step
     seed : of the initial weights and of the order
 
@@ -145,13 +146,13 @@ def train_predictor(
     Raises
     ------
     ShapeError : the rows are of another latent space, or not finite.
-    LabelStoreError : all rows collide, or none does, or none is held out.
+    LabelStoreError : all training rows collide, or none does, or none is held out.
     LCollisionError : the checkpoint belongs to another run or is damaged, the training diverges,
         or there is no such device.
     CancelledError : the job was cancelled; the checkpoint holds the last step, or the file beside
-        it, see `patches_path`, what was labelled up to the last twentieth.
+        it, see `patches_path`, the patches labelled up to the last twentieth.
     """
-    # Here, so that reading a predictor's types loads no torch.
+    # Imported here, so that reading a predictor's types loads no torch.
     from lcollision_core.predictor.training_loop import TrainingLoop
 
     config = PRESETS["default"] if config is None else config
