@@ -1,6 +1,6 @@
-"""Damaged, lying and hostile files: one sentence that names them, or something valid.
+"""Damaged, inconsistent and hostile files: one sentence that names them, or a valid result.
 
-None may take much memory, none runs code of its own, and no pipe or device is opened.
+None may use much memory, none executes code, and no pipe or device is opened.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ from tests.smpl_files import Arrays, motion_arrays, tiny_arrays
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1.5, 0], [0, 0, -2.25]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 MOST_MEMORY = 100 << 20
-"""Bytes that a damaged file of some kilobytes may take at a time."""
+"""Peak memory in bytes allowed for a damaged file of some kilobytes."""
 
 
 def refused(path: Path, read: Callable[[Path], object], is_traced: bool = True) -> bool:
-    """Tell whether a file is refused, which it may be in one short sentence that names it.
+    """Return whether a file is refused, which must be in one short sentence that names it.
 
-    Reading is several times slower where its memory is traced.
+    Tracing the memory makes reading several times slower.
     """
     sentences = []
 
@@ -111,7 +111,7 @@ def _set(path: Path) -> None:
 
 
 def _character(path: Path) -> None:
-    """Read a character with all frames, and the same as a mesh."""
+    """Read a character with all its frames, and the file as a mesh."""
     character = read_character(path)
     _require_valid(character.rest_vertices, character.topology.faces)
     assert character.joined.max() < character.topology.n_vertices
@@ -163,7 +163,7 @@ TEXTS = {
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file: how a whole one is written, and how it is read and judged."""
+    """A kind of file: how an intact one is written, read and judged."""
 
     write: Callable[[Path], object]
     read: Callable[[Path], None]
@@ -197,12 +197,12 @@ KINDS = {
 
 
 def _damaged(data: bytes, seed: int) -> bytes:
-    """Cut a file, overwrite some of its bytes, or repeat a stretch of it."""
+    """Truncate a file, overwrite some of its bytes, or repeat a part of it."""
     generator = np.random.default_rng(seed)
     result, kind = bytearray(data), seed % 4
     if kind == 0:
         del result[int(generator.integers(len(result))) :]
-    # Names, sizes and headers are where the most can go wrong.
+    # Names, sizes and headers are the most sensitive parts.
     end = len(result) if seed % 8 < 4 else min(200, len(result))
     for _ in range(int(generator.integers(1, 9)) if kind else 0):
         result[int(generator.integers(end))] = int(generator.integers(256))
@@ -257,7 +257,7 @@ def _all_places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, .
 
 
 def _with_hostile_value(seed: int) -> GltfBuilder:
-    """Replace one or two values of a description by ones that it should not have."""
+    """Replace one or two values of a description by invalid ones."""
     generator = np.random.default_rng(seed)
     builder = arm()
     builder.description |= {"scene": 0, "scenes": [{"nodes": [0]}]}
@@ -314,7 +314,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="module", params=["default", "paper"])
 def preset_sections(request: pytest.FixtureRequest) -> tuple[str, Sections]:
-    """Return a preset, and the sections of a model with its predictor and all else."""
+    """Return a preset, and the sections of a model with its predictor."""
     return request.param, _whole(request.param)
 
 
@@ -355,7 +355,7 @@ def _whole(preset: str) -> Sections:
 
 
 def _write(path: Path, sections: Sections) -> Path:
-    """Write a model file with a right checksum, whatever the sections hold."""
+    """Write a model file with a correct checksum, whatever the sections contain."""
     tensors = {
         f"{section_name}/{name}": np.ascontiguousarray(array).reshape(array.shape)
         for section_name, section in sections.items()
@@ -407,11 +407,11 @@ COMPUTED_WITH = {
     *("height", "up_axis", "near_exclusion", "scaling", "n_vertices", "n_domains"),
     *("preset", "by_domain", "energy_scale", "margin", "logit_shift"),
 }
-"""Metadata that more than a report depends on."""
+"""Metadata on which more than a report depends."""
 
 
 def _is_refused(path: Path, uses: tuple[Use, ...] = EVERY_USE) -> bool:
-    """Use a model as the commands and the editor do; only loading it may refuse it."""
+    """Use a model as the commands and the editor do; only loading may refuse it."""
     models: list[LearnedBody] = []
     if refused(path, lambda path: models.append(LearnedBody.load(path)), is_traced=False):
         return True
@@ -439,7 +439,7 @@ def test_a_model_with_any_value_changed(tmp_path: Path) -> None:
             computed_with = COMPUTED_WITH.intersection(place)
             n_working += not _is_refused(path, EVERY_USE if computed_with else (_describe,))
     assert n_changes > 2000
-    # Of most fields a value of the table is another of their own.
+    # Some replacements are valid values of their fields.
     assert 100 < n_working < n_changes / 3
 
 
@@ -487,7 +487,7 @@ def test_a_damaged_model_is_listed_and_the_others_with_it(
     assert "sound" in [report["name"] for report in json.loads(result.stdout)]
 
 
-# Arrays of archives, and what runs where it is unpickled.
+# Arrays of archives, and objects that execute code when unpickled.
 
 
 @pytest.mark.slow
@@ -512,7 +512,7 @@ def test_a_pose_set_with_any_array_changed(tmp_path: Path) -> None:
 
 
 class Runs:
-    """What leaves a folder where it is unpickled."""
+    """An object that creates a folder when it is unpickled."""
 
     def __init__(self, left: Path) -> None:
         self.left = str(left)
@@ -568,7 +568,7 @@ def test_commands_refuse_them_and_write_nothing(lcollision: Lcollision, tmp_path
             assert result.stderr.count("\n") == 1
             assert "Traceback" not in result.output
             assert not out.exists()
-    # What is beside is copied, and not read.
+    # Other arrays of the archive are copied without being read.
     np.savez(motion, **(walk | {"info": pickled}))
     result = lcollision("resolve", sound, motion, "--motion", "-o", out)
     assert result.exit_code in (0, 1), result.output
@@ -578,15 +578,15 @@ def test_commands_refuse_them_and_write_nothing(lcollision: Lcollision, tmp_path
         np.load(out, allow_pickle=False)["info"]
 
 
-# What is no plain file, or lies elsewhere.
+# Paths that are not regular files, or are elsewhere.
 
 
 @pytest.mark.parametrize("kind", UNPLAIN_FILES)
 def test_what_is_no_plain_file_is_never_opened(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A pipe would wait for its writer for ever, a device never end."""
-    monkeypatch.chdir(tmp_path)  # Sockets have short names only.
+    """A pipe would wait for its writer for ever, and a device never ends."""
+    monkeypatch.chdir(tmp_path)  # Socket names must be short.
     readers: dict[str, Callable[[Path], Any]] = {
         **dict.fromkeys(READABLE_SUFFIXES, read_mesh),
         ".npz": read_pose_set,
@@ -597,7 +597,7 @@ def test_what_is_no_plain_file_is_never_opened(
     for suffix, read in readers.items():
         path = Path(f"f{suffix}")
         if kind == "a folder" and suffix == ".npz":
-            continue  # A folder is a pose set of another form.
+            continue  # A folder is another form of pose set.
         UNPLAIN_FILES[kind](path)
         with pytest.raises((LCollisionError, OSError)) as caught:
             read(path)
@@ -650,7 +650,7 @@ def test_a_glb_face_out_of_range_is_named(tmp_path: Path, expected: Topology | N
     path = tmp_path / "m.glb"
     write_mesh(path, VERTICES, FACES)
     data = path.read_bytes()
-    # A face that begins with these corners is in no other place of so small a file.
+    # In so small a file, these corners occur only at the face.
     for dtype in (np.uint8, np.uint16, np.uint32):
         row, changed = FACES[2].astype(dtype), FACES[2].astype(dtype)
         if data.count(row.tobytes()) == 1:
@@ -661,7 +661,7 @@ def test_a_glb_face_out_of_range_is_named(tmp_path: Path, expected: Topology | N
         read_mesh(path, topology=expected)
 
 
-# Sizes that lie.
+# False sizes.
 
 
 def _entry(header: bytes, data: bytes) -> bytes:
@@ -749,7 +749,7 @@ CORNERS = np.stack([np.arange(N_ROWS - 2) + i for i in range(3)], axis=1)
 
 
 def _text_of(suffix: str) -> str:
-    """Return a mesh in which nothing is plain, so that no short way through is taken."""
+    """Return an unusual mesh text, so that no fast path is taken."""
     points = [f"{x:.7g} {y:.7g} {z:.7g}" for x, y, z in POINTS.tolist()]
     odd = ["1_0 0 0", *points[1:]]
     rows = [" ".join(map(str, row)) for row in CORNERS.tolist()]
@@ -775,7 +775,7 @@ def _text_of(suffix: str) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl"])
 def test_text_takes_memory_by_its_size(suffix: str, tmp_path: Path) -> None:
-    """Words and lines as Python's objects took thirty times the file, all at the same time."""
+    """Words and lines as Python objects took thirty times the file's size."""
     path = tmp_path / f"m{suffix}"
     path.write_text(_text_of(suffix))
     meshes = []

@@ -1,4 +1,4 @@
-"""What the editor keeps of a user, replaced by pipes: it starts all the same."""
+"""The editor starts even if the files that it keeps for a user are replaced by pipes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Model files of the version before this one are read, and say the same."""
+"""Model files of the previous version are read, with the same results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lcollision_core.resolve import find_free_poses
 def test_a_model_of_version_1_resolves_to_the_same_result(
     editor_model: LearnedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It had no latent box: its training codes tell which was meant."""
+    """It had no latent box: the box follows from its training codes."""
     old, new, again = (tmp_path / f"{name}.safetensors" for name in ("old", "new", "again"))
     free = find_free_poses(editor_model.embedding, editor_model.exact_check())
     editor_model.with_free_poses(free).save(new)

@@ -1,4 +1,4 @@
-"""The Qt binding that the editor will stand on, held to what made releases of it unusable."""
+"""The editor's Qt binding, tested for bugs that made releases of it unusable."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from PySide6.QtCore import QObject, QTimer
 
 @pytest.mark.skipif(sys.version_info >= (3, 12), reason="None is immortal from Python 3.12 on")
 def test_a_call_that_returns_nothing_keeps_its_reference_to_none() -> None:
-    """PySide6 6.12.0 drops one a call on Python 3.11, which aborts the program after seconds."""
+    """PySide6 6.12.0 drops one per call on Python 3.11, which aborts the program after seconds."""
     thing, timer = QObject(), QTimer()
     before = sys.getrefcount(None)
     for _ in range(1000):

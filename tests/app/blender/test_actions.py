@@ -1,4 +1,4 @@
-"""Actions in real Blender, without a window: nothing of the user's is lost."""
+"""Actions in real Blender, without a window: no user data is lost."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_outside_of_the_spans_nothing_changes_and_the_old_action_is_kept(
     assert 10 < inside.sum() < 50
     assert (before != after)[inside].any()
     assert np.array_equal(before[~inside], after[~inside])
-    # Curves of what does not turn are as they were; those that turn are keyed where they must be.
+    # Curves of unturned bones are unchanged; those of turned bones are keyed where needed.
     assert told["others"]
     added = {name: len(times) - 3 for name, times in told["keys"].items() if "rotation" in name}
     assert added
@@ -118,7 +118,7 @@ def test_an_action_goes_on_from_what_blender_shows_until_that_is_free(
     assert told["verdict"] == "No collisions in 11 frames (checked)"
     assert told["said"][0] == ["FINISHED"]
     assert told["steps"] > 1
-    # What the modifier shows has no bones of its own, and what is in its plane stays.
+    # The modifier's side is not keyed, and bones in its plane stay.
     assert "LeftArm" in told["keyed"]
     assert not {"Hips", "Spine", "Neck", "Head", "RightArm"} & set(told["keyed"])
 
@@ -136,7 +136,7 @@ def test_where_nothing_can_turn_nothing_is_written(body: Path, tmp_path: Path) -
 def test_what_is_worse_than_it_was_is_not_written(body: Path, tmp_path: Path) -> None:
     told = in_blender(tmp_path, "worse", body, script=SCRIPT)
     whole, shown = told["all"], told["shown"]
-    # All frames were shown to be worse, and then to be as they were.
+    # All frames were shown to be worse, and then restored.
     assert len(shown[0]) == 14
     assert all(shown[0])
     assert not any(shown[-1])
@@ -145,8 +145,8 @@ def test_what_is_worse_than_it_was_is_not_written(body: Path, tmp_path: Path) ->
     assert "could not be freed, nothing was changed" in said
     assert whole["changed"] == []
     assert whole["before"] == whole["after"]
-    # Of two spans one is free but for a frame that is worse, or for an arm that jumps to and fro:
-    # it stays to the bit, the other one is written.
+    # One of two spans is free except for a worse frame, or for an arm that jumps back and forth: it
+    # stays bit-identical, and the other one is written.
     for name in ("one", "jump"):
         one = told[name]
         (done, (level, said)) = one["said"]

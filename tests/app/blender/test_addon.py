@@ -40,9 +40,9 @@ def forest(body: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def crossing_the_arm(told: Any, points: Any) -> int:
-    """Count, independently, the crossing faces of which one is the left arm's, the other not.
+    """Count, independently, the crossing faces of the left arm and the rest.
 
-    They are far apart at rest, so that no contact rule leaves them out.
+    They are far apart at rest, so no contact rule excludes them.
     """
     faces = np.array(told["faces"])
     owner = np.array([name.startswith("Left") and "Leg" not in name for name in told["groups"]])
@@ -151,7 +151,7 @@ def test_a_clearance_is_checked_and_kept(body: Path, tmp_path: Path) -> None:
     assert told["near"]["details"][0].startswith("Short by ")
     assert any(line.startswith("prop: ") and line.endswith(" clearance") for line in told["panel"])
     assert told["kept"]["verdict"] == "The clearance is kept (checked)"
-    # Independently: corners of the arm are so far from corners of all else that is far at rest.
+    # Independently: the distance of the arm's vertices from all others that are far at rest.
     points, groups = np.array(told["points"]), np.array(told["groups"])
     arm, trunk = points[groups == "LeftForeArm"], points[np.isin(groups, ["Spine", "Hips"])]
     assert np.linalg.norm(arm[:, None] - trunk[None], axis=2).min() > metres
@@ -179,7 +179,7 @@ def test_several_meshes_on_one_armature_are_one_character(body: Path, tmp_path: 
 
 
 def crossing_the_staff(told: Any) -> int:
-    """Count, independently, the faces of the staff that cross others than the hand's."""
+    """Count, independently, the faces of the staff that cross faces other than the hand's."""
     faces, groups = np.array(told["faces"]), np.array(told["groups"])
     is_staff = (faces >= len(groups) - STAFF_VERTICES).all(axis=1)
     is_hand = (groups == "LeftHand")[faces].any(axis=1) & ~is_staff
@@ -201,7 +201,7 @@ def test_what_bones_carry_is_checked_listed_and_left_out_if_unticked(
     assert {"prop: Body", "prop: Hat", "prop: Staff"} <= set(told["panel"])
     assert n_pairs(told["lowered"]) > 0
     assert crossing_the_staff(told["before"]) > 0
-    # What a foreign check finds is what is counted, and what the rules leave out, as is said.
+    # An independent check finds the counted pairs and those that the rules leave out.
     crossing = crossing_pairs(
         np.array(told["before"]["points"], float), np.array(told["before"]["faces"])
     )
@@ -216,7 +216,7 @@ def test_what_bones_carry_is_checked_listed_and_left_out_if_unticked(
     assert told["hidden"]["verdict"] == "No collisions (checked without 2 meshes)"
     assert told["resolved"]["verdict"] == FREE
     assert crossing_the_staff(told["after"]) == 0
-    # A copy is written: all that bones carry goes along, and the originals are not rendered.
+    # A copy is written: everything that bones carry is copied, and the originals are not rendered.
     assert told["baked"]["verdict"] == "No collisions (checked without 1 mesh)"
     assert told["carried"] == [
         ["Hat.free", "Head"],
@@ -273,7 +273,7 @@ def test_the_live_check_follows_the_newest_pose(body: Path, tmp_path: Path) -> N
     assert told["shown"][1] > 0
     assert told["shown"][1] % 3 == 0
     assert "_on_update" not in told["handlers"]
-    # A file that is loaded with it on is looked at, without the faces of the one before.
+    # A file loaded with the live check on is checked, without the previous file's faces.
     loaded = told["loaded"]
     assert (loaded["shown"], loaded["handlers"], loaded["timer"]) == (0, ["_on_update"], True)
     assert loaded["verdict"].startswith("Colliding")
@@ -435,7 +435,7 @@ def test_a_hung_engine_is_ended_and_neither_a_window_nor_its_end_waits(
     assert told["ended"] == 3 * [-signal.SIGKILL]
     assert len(told["said"]) == 4
     assert told["again"] == told["first"]
-    # The test has turned the arm by nothing itself, up to rounding.
+    # The test itself has not turned the arm, up to rounding.
     assert told["moved"] < 1e-5
     assert told["quit"] == -signal.SIGKILL
 
@@ -489,7 +489,7 @@ def test_what_the_window_offers_the_panel_offers_too(tmp_path: Path) -> None:
     assert verdict == FREE
     assert set(turned) <= {"LeftArm", "LeftForeArm"}
     assert told["tolerated"] == FREE
-    # A verdict says what it leaves out, of a pose and of an action.
+    # Verdicts on a pose and on an action say what they leave out.
     assert re.fullmatch(
         r"\d+ pairs? not deeper than [\d.]+ (is|are) not counted", told["not_counted"]
     )
@@ -523,7 +523,7 @@ def test_a_mesh_that_changes_with_the_pose_is_said_in_words(body: Path, tmp_path
 
 
 def in_file_order(body: Any, points: Any) -> Any:
-    """Return (..., V, 3) vertices of a character as its file has them.
+    """Return (..., V, 3) vertices of a character in its file's axes and order.
 
     Blender is z up, glTF y up; the importer keeps the order of the file's vertices.
     """
@@ -546,7 +546,7 @@ def test_poses_of_real_characters_are_resolved(characters: Path, tmp_path: Path,
     assert n_pairs(told["before"]) > 100
     assert told["after"]["verdict"] == FREE
     assert told["undone"]
-    # By the file's own order and rules, without the add-on.
+    # In the file's order and by its rules, without the add-on.
     body = open_body(source)
     check = body.exact_check()
     assert check.find(in_file_order(body, told["points_before"])).colliding
@@ -569,7 +569,7 @@ def test_actions_of_real_characters_are_resolved(
     )
     assert [at for at in range(90) if check.find(before[at]).colliding] == told["colliding"]
     assert [at for at in range(90) if check.find(after[at]).colliding] == []
-    # As smooth as it was, in the frames that changed and those beside them.
+    # As smooth as before, in the changed frames and their neighbours.
     moved = np.flatnonzero(np.abs(after - before).max(axis=(1, 2)) > 1e-4)
     near = np.unique([moved - 1, moved, moved + 1])
     near = near[(near >= 1) & (near < 89)] - 1

@@ -43,7 +43,7 @@ def test_a_motion_is_fit_for_cloth_by_a_foreign_check(
     assert len(after) == 95
     owner = np.array([name.startswith("LeftArm") for name in told["groups"]])
     of_arm = owner[faces].all(axis=1)
-    # Of the tubes, which all cross where joints link them, the arm and the trunk.
+    # Only the arm and the trunk: linked tubes all cross at their joints.
     trunk = np.array([name in ("Hips", "Spine") for name in told["groups"]])[faces].all(axis=1)
     chosen = faces[of_arm | trunk]
     assert by_ipctk(before, chosen)[0]

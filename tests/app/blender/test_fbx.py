@@ -24,7 +24,7 @@ RATES = {
     "pal": (25, 1.0, 1, 26),
     "odd": (55, 2.0, 1, 20),
 }
-"""Frames a second and what they are divided by, the first frame, and how many."""
+"""Frame rate and its divisor, the first frame, and the number of frames."""
 
 
 def test_frames_and_vertices_are_those_of_blender_at_any_rate(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Rigify's human in real Blender: what is resolved is posed by the rig's own controls."""
+"""Rigify's human in real Blender: resolved poses are set by the rig's own controls."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def human(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def crossing_the_arm(told: Any, points: Any) -> int:
-    """Count, independently, the crossing faces of the left lower arm and of trunk and legs."""
+    """Count, independently, the crossing faces of the left forearm with trunk and legs."""
     names = [name.removeprefix("DEF-") for name in told["groups"]]
     arm = np.array([name.startswith(("forearm.L", "hand.L")) for name in names])
     other = np.array([name.startswith(("spine", "thigh")) for name in names])
@@ -52,7 +52,7 @@ def test_a_pose_is_resolved_by_the_controls_of_rigifys_human(human: Any) -> None
     assert "written to the controls" in text
     limbs = [name.replace("_parent", "") for name in told["after"]["by_fk"]]
     assert ("posed by FK now: " + ", ".join(limbs) in text) if limbs else "FK" not in text
-    # Nothing but controls is turned.
+    # Only controls are turned.
     assert told["changed"]
     assert not any(name.startswith(("DEF-", "ORG-", "MCH-")) for name in told["changed"])
 

@@ -1,4 +1,4 @@
-"""Faces that are written as weights, against Blender's own evaluation of the files."""
+"""Facial shapes written as weights, against Blender's own evaluation of the files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_posed_faces_are_those_of_blender(tmp_path: Path) -> None:
     body = RigBody.of(read_character(face(tmp_path / "face.glb")))
     codes = np.zeros((4, body.latent_size))
     codes[1:, 6] = 0.2, 0.5, 0.8
-    # Blender has no weights beyond 1.
+    # Blender clips weights at 1.
     codes[1:, body.shape_codes] = [0.5, 0.0, -0.2], [0.0, 1.0, 0.5], [1.0, 0.3, 0.0]
     expected = np.stack([body.exported_vertices(row, None) for row in codes])
     posed, clip = tmp_path / "posed.glb", tmp_path / "clip.glb"

@@ -1,4 +1,4 @@
-"""``lcollision check``: its verdict, its JSON, its exit status, its sentences."""
+"""``lcollision check``: verdict, JSON, exit status and sentences."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_open_mesh_is_checked_with_a_warning(lcollision: Lcollision, apart: Path
 
 def test_near_pairs_are_counted_apart(lcollision: Lcollision, tmp_path: Path) -> None:
     strip = tmp_path / "strip.obj"
-    # The faces 0 and 3 of a folded strip of four share no vertex; one edge joins them.
+    # Faces 0 and 3 of a folded strip of four share no vertex; one edge joins them.
     strip.write_text(
         "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nv 0.2 0.2 0.5\nv 0.3 0.2 -0.1\n"
         "f 1 2 3\nf 2 4 3\nf 3 4 5\nf 4 6 5\n"
@@ -286,7 +286,7 @@ def test_a_bug_does_not_look_like_an_answer() -> None:
 
 @pytest.fixture
 def exported(lcollision: Lcollision, tmp_path: Path) -> Callable[..., Path]:
-    """Write a pose of a character whose shins run into its feet, which its rules ignore."""
+    """Write a pose of a character whose shins penetrate its feet, which its rules ignore."""
     hero = write_gltf(head_in_torso(), tmp_path / "hero.glb")
     model = open_body(hero)
     write_poses(tmp_path / "poses.json", model, [NamedPose("bow", np.full(model.latent_size, 0.1))])
@@ -311,7 +311,7 @@ def test_a_character_s_file_written_here_is_checked_by_its_rules_anywhere(
     form: str,
 ) -> None:
     out = exported("posed.glb", "--form", form)
-    # Another machine has neither the character nor what was chosen for it.
+    # Another machine has neither the character nor its chosen rules.
     (tmp_path / "hero.glb").unlink()
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "elsewhere"))
     result = lcollision("check", out)
@@ -342,7 +342,7 @@ def test_a_mesh_of_a_character_that_was_opened_is_checked_by_its_rules(
         exported(name, "--axes", "unreal")
     (report,) = json.loads(lcollision("check", "--json", out).stdout)
     assert (report["colliding"], report["rules_of"]) == (False, "hero")
-    # Its energies are of its own unit, whatever that of the file.
+    # Its energies are in its own unit, whatever the file's unit.
     depth = lcollision("check", "--json", out, "--tolerated-depth", 0.5)
     assert json.loads(depth.stdout)[0]["rules"]["tolerated_depth"] == 0.5
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "elsewhere"))
@@ -408,7 +408,7 @@ def test_parts_in_another_order_and_scenery_do_not_confuse_what_is_checked(
 ) -> None:
     builder = figure()
     nodes = builder.description["nodes"]
-    # Two nodes show one mesh, of which the pose makes two; and there is a floor.
+    # Two nodes show one mesh, which becomes two in a pose; and there is a floor.
     nodes.append({"name": "Twin", "mesh": nodes[4]["mesh"], "skin": 0, "translation": [9, 0, 0]})
     floor = builder.array(np.array([[0, -9, 0], [9, -9, 0], [0, -9, 9]]))
     primitive = {"attributes": {"POSITION": floor}, "indices": builder.array(np.arange(3), "u2")}

@@ -18,7 +18,7 @@ from tests.rigged_shapes import write_gltf
 
 
 def test_a_mesh_whose_parts_are_too_near_is_refused(lcollision: Lcollision, apart: Path) -> None:
-    """Its two faces are 0.1 apart, and it is 1 high."""
+    """The two faces are 0.1 apart, and the mesh is 1 high."""
     free = lcollision("check", apart, "--clearance", "0.09", "--json")
     assert free.exit_code == 0
     (report,) = json.loads(free.stdout)
@@ -56,7 +56,7 @@ def test_skin_is_measured_against_its_rest_pose(lcollision: Lcollision, tmp_path
     bent, rest = tmp_path / "bent.obj", ("--rest", tmp_path / "flat.obj")
     for options in ((), rest):
         assert lcollision("check", bent, "--clearance", "0.05", *options).exit_code == 0
-    # Blocks that are as near each other at rest.
+    # Blocks that are equally near at rest.
     one = box([0, 0, 0], [1, 1, 1])
     blocks = join(one, one.moved([1.02, 0, 0]))
     write_mesh(tmp_path / "blocks.obj", blocks.vertices, blocks.faces)
@@ -163,7 +163,7 @@ def test_motions_are_checked_and_resolved_with_a_clearance(
     row, _ = json.loads(result.stdout)
     assert row["free_before"] < row["free_after"] == row["frames"] == N_FRAMES
     assert row["least_distance"] is None or row["least_distance"] >= 0.005 - 1e-9
-    # As rounded in the file, it is still as far from itself.
+    # The rounded file still keeps the clearance.
     again = lcollision("check", free, "--clips", "--json", "--clearance", "0.0049")
     assert again.exit_code == 0, again.output
     said = lcollision("check", free, "--clips", "--clearance", "0.0049").stdout

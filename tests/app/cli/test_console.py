@@ -1,4 +1,4 @@
-"""The bars of long commands: drawn on a real terminal, a line now and then in a pipe."""
+"""Progress of long commands: a bar on a real terminal, occasional lines in a pipe."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_in_a_pipe_short_work_says_nothing() -> None:
 
 @pytest.mark.parametrize("name", ["label", "predictor"])
 def test_in_a_pipe_a_line_comes_every_half_minute(name: str) -> None:
-    """Here at once."""
+    """The interval is reduced to 0 here."""
     code, told = BARS[name]
     ours, theirs = os.pipe()
     draw(code, theirs, "import app.cli.console as c; c.SECONDS_BETWEEN_LINES = 0.0")

@@ -1,4 +1,4 @@
-"""The options that say which pairs of faces do not count, and how commands report them."""
+"""Contact rule options, and how commands report them."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_a_pair_of_groups_is_tolerated_up_to_its_own_depth(
     said = "; 1 pair not deeper than 0.11 between component 2 and component 1 is not counted"
     assert said in free.stdout
     assert lcollision("check", stabbed, "--tolerate", f"{pair}=0.09").exit_code == 1
-    # Its own depth stands for that of all others.
+    # A pair's own tolerated depth overrides the general one.
     strict = ("--tolerated-depth", 0.11, "--tolerate", f"{pair}=0", "--json")
     refused = lcollision("check", stabbed, *strict)
     assert refused.exit_code == 1
@@ -198,7 +198,7 @@ def test_joints_of_a_character_count_or_not_and_what_has_none_is_refused(
     assert "pairs at a joint that links their parts" in said
     off = json.loads(lcollision("contacts", path, "--json", "--no-joint-exclusion").stdout)
     assert off["rules"]["joint_exclusion"] is False
-    # It is remembered, as is what an older program remembered, which knows no such rule.
+    # The rule is remembered; so are rules stored by an older program that lacks it.
     assert "at a joint" not in lcollision("contacts", path).stdout
     (known,) = (tmp_path / "data" / "lcollision" / "characters").iterdir()
     document = json.loads(known.read_text())
@@ -216,7 +216,7 @@ def test_places_that_always_touch_are_listed_and_ignored_on_request(
     lcollision: Lcollision, tmp_path: Path
 ) -> None:
     path = write_gltf(head_in_torso(12), tmp_path / "body.glb")
-    # What touches at rest does not count at first.
+    # By default, pairs that touch at rest do not count.
     assert json.loads(lcollision("contacts", path, "--json").stdout)["proposed"] is None
     body = open_body(path)
     remember_choices(body.with_rules(ContactRules()))

@@ -21,7 +21,7 @@ CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
 
 @pytest.fixture
 def two_tetrahedra() -> PoseSet:
-    """Two watertight bodies: apart in pose 0, one poking 0.1 into the other in pose 1."""
+    """Two watertight bodies: apart in pose 0, one penetrating the other by 0.1 in pose 1."""
     apart = np.concatenate([CORNERS, CORNERS + [3.0, 0, 0]])
     poked = np.concatenate([CORNERS, CORNERS + [0.2, 0.2, -0.9]])
     topology = Topology(np.concatenate([TETRAHEDRON, TETRAHEDRON + 4]), 8)
@@ -238,7 +238,7 @@ def test_a_rig_makes_the_poses_of_a_set(lcollision: Lcollision, tmp_path: Path) 
     assert again.read_bytes() == first.read_bytes()
     lcollision("dataset", "make", file, "--by-rig", 6, "-o", other)
     assert not np.array_equal(read_pose_set(other).vertices, poses.vertices)
-    # What has no animation is no pose set by itself.
+    # A file without animation is not a pose set by itself.
     result = lcollision("dataset", "make", file, "-o", tmp_path / "none.npz")
     assert result.exit_code == 2
     assert "it contains no animation" in result.stderr

@@ -35,7 +35,7 @@ def model_file(model: LearnedBody, tmp_path_factory: pytest.TempPathFactory) -> 
 def meshes_of(
     model: LearnedBody, folder: Path, distance: float, factor: float = 1.0
 ) -> list[np.ndarray]:
-    """Write four colliding meshes and a free one, with details of their own, as OBJ."""
+    """Write four colliding meshes and a free one as OBJ, each with its own detail."""
     folder.mkdir()
     latents = [*sample_poses(model, 4, seed=5, colliding=True), np.zeros(model.latent_size)]
     detail = 1e-3 * model.body_size * np.sin(np.arange(model.n_vertices))[:, None]
@@ -74,7 +74,7 @@ def test_far_meshes_are_free_as_they_are_written(
         assert crossing_pairs(vertices - vertices.mean(axis=0), faces) == set()
         size = factor * model.body_size
         moved = np.linalg.norm(vertices - original, axis=1) / size
-        # What is claimed, and what encoding loses of the detail.
+        # The reported change, plus the detail that encoding loses.
         assert moved.max() < row["vertex_distance_max"] + 4e-3
         assert moved.max() >= 0.5 * row["vertex_distance_max"]
     check = lcollision("check", out)

@@ -1,4 +1,4 @@
-"""The command line before any command runs: quick, light, and complete."""
+"""The command line before any command runs: fast, light and complete."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_contact_and_meshes_load_neither_torch_nor_a_front_end() -> None:
 
 
 def test_the_page_of_commands_is_what_help_says() -> None:
-    """Else make it anew: python -m tests.app.cli.commands_page > docs/commands.md."""
+    """To regenerate the page: python -m tests.app.cli.commands_page > docs/commands.md."""
     root = Path(__file__).parents[3]
     assert (root / "docs" / "commands.md").read_text(encoding="utf-8") == page()
     assert "](docs/commands.md)" in (root / "README.md").read_text(encoding="utf-8")
@@ -93,7 +93,7 @@ def test_the_editor_opens_what_it_is_given_with_its_command_or_without(
         return 0
 
     monkeypatch.setattr("app.window.editor.open_editor", open_editor)
-    # A file may be called as no command is, even without an extension.
+    # A file needs no extension if its name is not a command's.
     monkeypatch.chdir(stabbed.parent)
     plain = Path(stabbed.stem)
     plain.write_bytes(stabbed.read_bytes())

@@ -1,4 +1,4 @@
-"""What commands say of joints that are not known, and how the user says what they are."""
+"""Reports on joints with unknown roles, and setting the roles by command."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ SECONDS_TO_WAIT = 600.0
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the file of a model that was hardly trained; what it learnt matters little here."""
+    """Return the file of a barely trained model: its quality does not matter here."""
     poses = bending_tube()
     config = EmbeddingConfig(
         n_domains=2, n_domain_codes=3, level1_epochs=10, level2_epochs=2, held_out_stride=0

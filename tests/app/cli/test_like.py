@@ -42,7 +42,7 @@ def poses(body: LearnedBody, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def own(body: LearnedBody, tmp_path: Path) -> Path:
-    """Write the body as an OBJ file with what programs add: materials, UVs, groups."""
+    """Write the body as an OBJ file with materials, UVs and groups, as programs do."""
     path = tmp_path / "own.obj"
     write_mesh(path, body.reference, body.faces)
     content = path.read_bytes().replace(b"\nf", b"\nvt 0 1\ng all\nusemtl skin\nf", 1)
@@ -102,7 +102,7 @@ def test_a_folder_of_a_character_has_its_own_files(lcollision: Lcollision, tmp_p
     assert sorted(path.name for path in out.iterdir()) == ["one.glb", "two.glb"]
     posed = read_character(out / "one.glb").rest_vertices
     np.testing.assert_allclose(posed, model.decode(turned), atol=1e-5)
-    # Programs' axes and units are those of OBJ files.
+    # Axes and units for programs apply to OBJ files.
     for_maya = tmp_path / "maya"
     assert lcollision("decode", hero, poses, "-o", for_maya, "--axes", "maya").exit_code == 0
     assert {path.suffix for path in for_maya.iterdir()} == {".obj"}
@@ -125,7 +125,7 @@ def test_clips_are_kept_where_that_is_asked_for(lcollision: Lcollision, tmp_path
         assert list(again.clips) == ["wave", "walk", "orbit"]
         size = float(np.ptp(again.rest_vertices, axis=0).max())
         shown = np.abs(again.rest_vertices - model.decode(turned)).max()
-        # It is not free of collisions.
+        # The decoded pose is not free of collisions.
         assert (shown < 1e-5 * size) == (command == "decode")
         before, after = (read_character(file).sample("wave", None) for file in (hero, out))
         assert np.abs(after.vertices - before.vertices).max() < 1e-6 * size
@@ -163,7 +163,7 @@ def test_poses_of_an_fbx_come_back_in_a_rigged_glb(lcollision: Lcollision, tmp_p
     kept = lcollision("decode", hero, poses, "-o", joints, "--keep-clips")
     assert kept.exit_code == 0, kept.output
     assert list(read_character(joints / "one.glb").clips) == [CLIP, OTHER]
-    # What was exported is known by its rules, and resolved as well.
+    # The exported file is checked by its character's rules, and can be resolved.
     assert lcollision("check", joints / "one.glb").exit_code == 0
     done = lcollision("resolve", hero, hero, "-o", tmp_path / "rest.glb")
     assert done.exit_code == 0, done.output
@@ -279,7 +279,7 @@ def test_a_pose_is_written_in_whatever_form_can_hold_it(
     assert (posed.rig is None) == sheared
     expected = model.decode(latent)[_joined(own)]
     assert np.abs(posed.rest_vertices[posed.joined] - expected).max() < 1e-5
-    # Frames of a clip have no other form: what is done stays.
+    # Frames of a clip have no other form: the finished poses stay.
     words = ("resolve", own, tmp_path / "poses.json", "-o", tmp_path / "run.glb", "--form", "clip")
     done = lcollision(*words)
     assert (done.exit_code == 2) == sheared

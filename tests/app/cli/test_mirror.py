@@ -1,4 +1,4 @@
-"""``lcollision mirror``: what is written, what is said, and the exit status."""
+"""``lcollision mirror``: output files, reports and exit status."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def body() -> LearnedBody:
 
 @pytest.fixture
 def poses(body: LearnedBody, tmp_path: Path) -> Path:
-    """Return a file of a placed free pose, one that collides mirrored only, and a colliding one."""
+    """Return a file of a placed free pose, one that collides only mirrored, and a colliding one."""
     drawn = body.latent_space.sample(3, np.random.default_rng(0))
     placement = RigidTransform(np.eye(3), np.array([1.0, 0.0, 0.0]))
     path = tmp_path / "poses.json"
@@ -114,7 +114,7 @@ def test_what_cannot_be_mirrored_is_one_sentence(
 def test_a_body_that_is_not_symmetric_is_mirrored_as_nearly_as_it_can_be(
     lcollision: Lcollision, tmp_path: Path
 ) -> None:
-    """The dance begins in a pose that is not quite symmetric."""
+    """The dance starts in a pose that is not quite symmetric."""
     swing, given, images = LearnedBody.load("body-swing"), tmp_path / "a.json", tmp_path / "b.json"
     write_poses(given, swing, [NamedPose("first", swing.known_poses[30])])
     done = lcollision("mirror", "body-swing", given, "-o", images, "--json")

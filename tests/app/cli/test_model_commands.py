@@ -70,7 +70,7 @@ def tube(trained: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def user_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep the tests from the models of whoever runs them."""
+    """Hide the models of the user who runs the tests."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     return tmp_path / "data" / "lcollision" / "models"
 
@@ -252,7 +252,7 @@ def test_figure_shows_each_domain_in_its_colour(
 def test_a_figure_is_drawn_without_a_word_where_nothing_can_be_cached(
     tube: Path, tmp_path: Path
 ) -> None:
-    # Also for root, nothing can be made below a file.
+    # Even root cannot create anything below a file.
     home, path = tmp_path / "home", tmp_path / "masks.png"
     home.touch()
     kept = {name: value for name, value in os.environ.items() if not name.startswith("XDG_")}
@@ -592,7 +592,7 @@ def test_an_interrupted_training_goes_on_and_ends_with_the_same_model(
 def test_a_mesh_far_from_every_pose_is_doubted(
     lcollision: Lcollision, tube: Path, tmp_path: Path
 ) -> None:
-    """A flattened one, whose edges are the body's, near enough."""
+    """The mesh is flattened, with edges about as long as the body's."""
     model = LearnedBody.load(tube)
     mesh = tmp_path / "flat.obj"
     write_mesh(mesh, model.reference * [1.0, 1.0, 0.02], model.faces)
@@ -616,7 +616,7 @@ def test_glb_is_upright_whatever_is_up_in_the_model(
     decoded = model.decode(read_poses(poses, model)[0].latent).astype(np.float32)
     written = read_mesh(mesh).vertices
     assert np.array_equal(written, decoded[:, [0, 2, 1]] * [1.0, 1.0, -1.0])
-    # A mesh that came in upright goes out in its place.
+    # A mesh imported upright is exported in its original placement.
     placed, again = tmp_path / "placed.json", tmp_path / "again.glb"
     assert lcollision("encode", turned, mesh, "-o", placed).exit_code == 0
     assert lcollision("decode", turned, placed, "-o", again).exit_code == 0

@@ -169,7 +169,7 @@ def test_a_character_gets_its_own_file_back_with_its_clip_free(
         read_motions(body, path, OTHER) for body, path in ((before, swing), (after, free))
     )
     assert new.codes.tobytes() == old.codes.tobytes()
-    # Nothing is left of what was kept meanwhile.
+    # No intermediate files are left.
     assert sorted(path.name for path in tmp_path.iterdir()) == ["free.glb"]
 
 
@@ -191,7 +191,7 @@ def test_a_motion_is_also_written_as_poses_and_as_frames(
     assert [pose.name for pose in held][:2] == [f"{CLIP} 0", f"{CLIP} 1"]
     assert len(held) == N_FRAMES // 2
     assert body.exact_check().are_free(np.array([pose.latent for pose in held])).all()
-    # Poses are a motion again, and the free one stays as it is.
+    # Poses form a motion again, and a free motion does not change.
     again = lcollision("resolve", swing, poses, "--motion", "-o", tmp_path / "again.json", "--json")
     assert again.exit_code == 0, again.output
     (row,) = json.loads(again.stdout)
@@ -244,7 +244,7 @@ def test_a_folder_of_meshes_and_a_pose_set_are_motions_in_natural_order(
     assert cache_rate(out) == pytest.approx(7.5)
     free = read_point_cache(out)
     change = np.abs(free - frames).max(axis=(1, 2)) / body.body_size
-    # Before the easing, frames are as they were.
+    # Before the easing, frames are unchanged.
     assert change[0] < 1e-6
     assert change[colliding].min() > 1e-3
 
@@ -269,7 +269,7 @@ def test_a_rigged_fbx_comes_back_as_a_rigged_glb_with_its_clip_free(
     assert after.rig is not None
     assert after.rig.joint_names == before.rig.joint_names
     np.testing.assert_array_equal(after.topology.faces, before.topology.faces)
-    # From z up, in centimetres: the other clip is as it was.
+    # From z up, in centimetres: the other clip is unchanged.
     for clip in (CLIP, OTHER):
         old, new = (one.sample(clip, 30.0) for one in (before, after))
         moved = 0.01 * old.vertices[..., [0, 2, 1]] * [1.0, 1.0, -1.0] - new.vertices
@@ -317,7 +317,7 @@ def test_a_skeletons_motion_comes_back_in_its_own_file(
 
 
 def captured(swing: Path, folder: Path, frames: Mapping[str, slice | list[int]]) -> Path:
-    """Make a folder of BVH files by their names, each with some frames of the swing."""
+    """Make a folder of BVH files by name, each with some frames of the swing."""
     body = open_body(swing)
     (motion,) = read_motions(body, swing, CLIP)
     folder.mkdir()
@@ -460,7 +460,7 @@ def test_a_stopped_folder_is_continued_with_what_is_left(
 def test_the_frames_of_motions_are_checked_as_single_meshes_are(
     lcollision: Lcollision, swing: Path, tmp_path: Path
 ) -> None:
-    """By --no-rules, by a rest pose of one's own, and every file of a folder."""
+    """With --no-rules, with a given rest pose, and for every file of a folder."""
     body = open_body(swing)
     (motion,) = read_motions(body, swing, CLIP)
     walk = tmp_path / "walk.mdd"
@@ -546,7 +546,7 @@ def test_a_motions_verdict_says_what_it_leaves_out(
 def test_options_that_would_do_nothing_are_refused(
     lcollision: Lcollision, tmp_path: Path, command: str, option: str
 ) -> None:
-    """Given with the value that they have by default, too; nothing is read or written."""
+    """Even if given with their default values; nothing is read or written."""
     name, *motion = command.split()
     out = () if name == "check" else ("-o", tmp_path / "out.json")
     result = lcollision(name, tmp_path / "none.glb", *motion, *out, option)

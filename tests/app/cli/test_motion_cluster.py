@@ -39,7 +39,7 @@ def swing(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def folder(swing: Path, tmp_path: Path) -> Path:
-    """Return a folder of two motions, one of which collides, and of one that cannot be read."""
+    """Return a folder of two motions, one of them colliding, and an unreadable one."""
     body = open_body(swing)
     (motion,) = read_motions(body, swing, CLIP)
     made = tmp_path / "captured"
@@ -51,7 +51,7 @@ def folder(swing: Path, tmp_path: Path) -> Path:
 
 
 def same(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows without what differs from run to run."""
+    """Return rows without the fields that differ from run to run."""
     return [{k: v for k, v in row.items() if k not in ("seconds", "output")} for row in rows]
 
 
@@ -62,7 +62,7 @@ def test_a_cluster_gives_the_rows_and_files_of_this_process(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # Other rules than the file's own, and paths that mean something here alone.
+    # Use rules other than the file's own, and paths relative to this process.
     monkeypatch.chdir(tmp_path)
     command = ("resolve", "swing.glb", "captured", "--motion", "--near-exclusion", 0.03, "--json")
     here = lcollision(*command, "-o", "here/")
@@ -71,7 +71,7 @@ def test_a_cluster_gives_the_rows_and_files_of_this_process(
     rows = json.loads(there.stdout)
     assert same(rows)[1:] == same(json.loads(here.stdout))[1:]
     assert [row["source"] for row in rows] == ["broken.bvh", "start.bvh", "whole.bvh"]
-    # A worker says which path it could not read.
+    # The worker reports the path that it could not read.
     assert f"{folder / 'broken.bvh'} cannot be read: " in rows[0]["error"]
     assert rows[0]["error"] in there.stderr
     assert [row["output"] for row in rows[1:]] == ["there/start.bvh", "there/whole.bvh"]

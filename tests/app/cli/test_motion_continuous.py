@@ -17,7 +17,7 @@ from tests.core.motion.swings import through_the_trunk
 from tests.rigged_shapes import skinned, write_gltf
 
 HIT = 13
-"""The frame after which the arm passes through the trunk, free in all frames."""
+"""The frame after which the arm passes through the trunk, though all frames are free."""
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_what_passes_through_between_frames_is_found_and_led_round(
     said = lcollision(*command, "--continuous").stdout
     assert f"contact between frames {HIT} and {HIT + 1}" in said
     free = tmp_path / "free.glb"
-    # The way round is farther than a quarter of the body size.
+    # The way around is longer than a quarter of the body size.
     far = ("--largest-change", 1)
     cloth = ("--motion", "--for-cloth", "--substeps", 0)
     resolved = lcollision("resolve", through, *cloth, *far, "-o", free, "--json")

@@ -1,4 +1,4 @@
-"""Resolved clips in programs that are not ours: VTK, trimesh, pygltflib and Blender.
+"""Resolved clips in third-party programs: VTK, trimesh, pygltflib and Blender.
 
 Blender's test runs where `bpy` can be imported, by default in this Python; the environment variable
 LCOLLISION_BPY names another one that has it.
@@ -46,7 +46,7 @@ def free(lcollision: Lcollision, source: Path, tmp_path: Path) -> Path:
 
 
 def proved(path: Path, clip: str) -> FloatArray:
-    """Return the (T, P, 3) points of the file's mesh that a clip's frames were proved free with."""
+    """Return the (T, P, 3) points of the file's mesh in a clip's frames, as checked free."""
     body = open_body(path)
     (motion,) = read_motions(body, path, clip)
     frames = list(clip_vertices(path.read_bytes(), path, clip, motion.times))
@@ -193,7 +193,7 @@ def in_blender(path: Path, clip: str, rate: float, n_frames: int, out: Path) -> 
 def run_in_blender(script: str, *arguments: str) -> FloatArray:
     """Return the array that a script writes to its last argument; skip without Blender."""
     python = python_with_bpy()
-    # The other Python has its own packages.
+    # The other Python must use its own packages.
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     process = subprocess.run(
         [python, "-c", script, *arguments],
@@ -216,7 +216,7 @@ def test_blender_plays_a_real_character_as_proved(
     lcollision: Lcollision, characters: Path, tmp_path: Path
 ) -> None:
     source, free = characters / "mannequin-moves.glb", tmp_path / "free.glb"
-    # Whether Blender is there is known before the work for it is done.
+    # Skip without Blender before doing the work for it.
     in_blender(source, "moves", RATE, 1, tmp_path / "one.npy")
     result = lcollision("resolve", source, "--motion", "-o", free, "--json")
     assert result.exit_code == 0, result.output

@@ -1,4 +1,4 @@
-"""Motions of every kind through the command: all frames free, and nothing else lost."""
+"""Motions of every kind through the command: all frames free, everything else kept."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ KINDS = {
     "240 frames": ({"n_frames": 240, "n_swings": 5}, "LINEAR"),
     "a cycle": ({"begin": 0.5}, "LINEAR"),
 }
-"""Arguments of `swinging_body`, and how the keys are interpolated."""
+"""Arguments of `swinging_body`, and the interpolation of the keys."""
 
 
 def key_times(path: Path, clip: str) -> np.ndarray:
@@ -77,7 +77,7 @@ def test_a_clip_of_any_kind_comes_back_free_and_whole(
         read_motions(body, path, CLIP) for body, path in ((before, source), (after, free))
     )
     assert after.exact_check().are_free(new.codes).all()
-    # The rate and every key are what they were; keys are new only at frames.
+    # The rate and every old key are unchanged; new keys are only at frames.
     assert new.rate == pytest.approx(shape.get("fps", 30.0), rel=1e-4)
     np.testing.assert_array_equal(new.times, old.times)
     kept, keys = key_times(source, CLIP), key_times(free, CLIP)
@@ -97,7 +97,7 @@ def test_a_clip_of_any_kind_comes_back_free_and_whole(
         read_motions(body, path, OTHER) for body, path in ((after, free), (before, source))
     )
     assert same.codes.tobytes() == nod.codes.tobytes()
-    # Where the body goes is not what is resolved.
+    # Resolving does not change the body's path.
     assert np.abs(new.codes - old.codes)[:, :3].max() < 0.03
     if kind == "25 metres":
         assert np.ptp(new.codes[:, :3], axis=0).max() * before.body_size > 20.0
@@ -108,7 +108,7 @@ def test_a_clip_of_any_kind_comes_back_free_and_whole(
 
 
 def _file_of(source: Path) -> tuple[GltfBuilder, int, int]:
-    """Return a file to be changed, and the nodes of its body and of its left forearm."""
+    """Return a file to modify, and the nodes of its body and of its left forearm."""
     builder = GltfBuilder()
     builder.description, builder.blob = described(source)
     names = [node["name"] for node in builder.description["nodes"]]
@@ -124,7 +124,7 @@ def _colliding(lcollision: Lcollision, path: Path, *options: str) -> dict[str, l
 
 
 def _of_file(path: Path, clip: str) -> list[int]:
-    """Return the frames that collide as the file has them."""
+    """Return the frames that collide in the file."""
     body = open_body(path)
     frames = body.character.sample(clip, None).skin()  # type: ignore[attr-defined]
     return np.flatnonzero(body.detector.are_colliding(frames.astype(np.float32))).tolist()
@@ -298,7 +298,7 @@ def test_a_clip_comes_back_free_as_the_motion_of_a_skeleton(
     assert len(motion) == N_FRAMES
     assert motion.rate == pytest.approx(24.0, rel=1e-5)
     assert body.exact_check().are_free(motion.codes).all()
-    # And from one such file to another, by the body that plays it.
+    # And from one format to the other, by the body that plays it.
     other = tmp_path / ("other.vrma" if kind == "bvh" else "other.bvh")
     again = lcollision("resolve", source, path, "--motion", "-o", other, "--json")
     assert again.exit_code == 0, again.output
@@ -352,7 +352,7 @@ def test_what_shapes_a_frame_turns_with_its_joints_in_every_form(
         held = vertices[body.topology.faces].reshape(-1, 3)
         np.testing.assert_allclose(shown, held, atol=1e-6 * body.body_size)
     result = lcollision("resolve", file, "--motion", "-o", poses, "--json")
-    # Poses hold the weights of morph targets.
+    # Poses contain the weights of morph targets.
     is_held = motion.space_at is None
     assert is_held == (file.stem == "arm_morph")
     left_out = f"what else shapes the frames of {motion.name} is left out"

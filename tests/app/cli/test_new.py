@@ -46,7 +46,7 @@ def test_a_pose_set_becomes_a_model_with_a_card_and_a_picture(
     assert card["model"] == str(model)
     assert Path(card["picture"]).read_bytes().startswith(b"\x89PNG")
     assert card["rules"] == LearnedBody.load(model).rules.to_json()
-    # Nothing is left beside it.
+    # No other files are left.
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "bent-parts.png",
         "bent.safetensors",
@@ -68,7 +68,7 @@ def test_a_character_is_posed_by_its_rig_and_given_back_in_its_own_file(
     assert model.card.pose_names[0] == "rest"
     assert sum("rig" in name for name in model.card.pose_names) == 20
     assert model.rules.ignored == (("Head", "Torso"),)
-    # Beside that it is posed by the rules by which its rig is.
+    # Apart from those, its rules are the rig's.
     assert replace(model.rules, ignored=()) == open_body(file).rules
     sources = model.card.provenance["poses"]["sources"]
     assert [one["by_rig"]["drawn"] for one in sources if "by_rig" in one] == [20]
@@ -81,7 +81,7 @@ def test_a_character_is_posed_by_its_rig_and_given_back_in_its_own_file(
     expected = model.decode(read_poses(sampled, model)[0].latent)
     held = read_mesh(posed, topology=model.topology)
     assert np.allclose(held.vertices, expected, atol=1e-5 * model.body_size)
-    # The character's own file: its joints are still nodes of it, its mesh has the name it had.
+    # The character's own file: its joints are still nodes, its mesh keeps its name.
     assert {"Body", "LeftForeArm"} <= set(read_scene(posed).node_names)
 
 
@@ -110,7 +110,7 @@ def test_what_cannot_be_learned_from_is_one_sentence(
 def test_where_nearly_all_samples_collide_it_stops_before_the_predictor(
     tmp_path: Path, lcollision: Lcollision, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # So that it stops, and a predictor can be trained all the same.
+    # Make the run stop; a predictor can still be trained.
     monkeypatch.setattr("lcollision_core.tasks.learning.NEARLY_ALL", 0.0)
     file, model = write_gltf(rigged_body(), tmp_path / "figure.glb"), tmp_path / "m.safetensors"
     arguments = ("new", file, "-o", model, "--quality", "quick", "--by-rig", "20")

@@ -1,4 +1,4 @@
-"""Options that are declared once, as fields of dataclasses."""
+"""Options declared once, as fields of dataclasses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.rigged_shapes import rigged_body, write_gltf
 
 @dataclass(frozen=True)
 class Choices:
-    """Of a test."""
+    """Options of the test command."""
 
     files: Annotated[tuple[str, ...], Option("What to read.", metavar="FILE...")]
     size: Annotated[float | None, Option("How large.", ("--big",), low=0.0, below=1.0)] = None
@@ -38,7 +38,7 @@ taken: list[Choices] = []
 
 @takes_options
 def command(choices: Annotated[Choices, Without({"kind"})], loud: bool = False) -> None:
-    """Keep what it gets."""
+    """Keep the received values."""
     taken.append(choices)
     assert loud in (True, False)
 

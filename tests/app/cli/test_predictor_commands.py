@@ -60,7 +60,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def store(model: Path) -> Path:
-    """Return its labelled samples."""
+    """Return the model's labelled samples."""
     path = model.with_name("store")
     command = [sys.executable, "-m", "app", "label", model, "-n", str(N_ROWS), "-o", path]
     subprocess.run(command, check=True, capture_output=True)
@@ -69,9 +69,9 @@ def store(model: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def trained(model: Path, store: Path) -> Path:
-    """Return a model with the paper's predictor, trained by the command itself.
+    """Return a model with the paper's predictor, trained by the command.
 
-    How well so small a one ranks depends on its seed, and of others on the processor too.
+    How well such a small predictor ranks depends on its seed; with others, on the processor too.
     """
     path = model.with_name("trained.safetensors")
     command = [sys.executable, "-m", "app", "train", "predictor", model, store, "-o", path]
@@ -87,7 +87,7 @@ def trained(model: Path, store: Path) -> Path:
 
 
 def _without_progress(said: str) -> str:
-    """Leave out the lines by which a slow machine tells how far its training is."""
+    """Remove the progress lines that a slow machine prints."""
     lines = said.splitlines(keepends=True)
     return "".join(
         line for line in lines if not re.match(r"lcollision: epoch \d+ of \d+: \d+ %", line)
@@ -103,7 +103,7 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
     curve = report.pop("calibration")
     assert [one["kind"] for one in report.pop("kinds")] == [kind.value for kind in PoseKind]
     sure = report.pop("sure")
-    assert [one["error_bound"] for one in sure] == [0.01, 0.03]  # so few samples confirm no less
+    assert [one["error_bound"] for one in sure] == [0.01, 0.03]  # more need more samples
     assert 0.0 < sure[0]["coverage"] < sure[1]["coverage"] <= 1.0
     assert [report.pop(name) for name in ("model", "level1_codes", "domain_codes")] == [
         "trained",
@@ -144,7 +144,7 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
     assert report["accuracy"] > report["majority_rate"] + 0.03
     assert report["spearman"] > 0.7
     assert sum(entry["samples"] for entry in curve) == report["samples"]
-    # What training measured on the rows it held out is what the file holds.
+    # The file contains the figures that training measured on the held-out rows.
     predictor = LearnedBody.load(trained).predictor
     assert predictor is not None
     assert predictor.metrics is not None
@@ -350,7 +350,7 @@ def test_a_killed_training_goes_on_to_the_same_model(
 def test_ctrl_c_keeps_a_checkpoint_and_says_so(
     model: Path, store: Path, tmp_path: Path, preset: str, kept: str
 ) -> None:
-    """The preset default begins with labelling patches, which are kept some rows at a time."""
+    """The preset default starts by labelling patches, which are stored some rows at a time."""
     output = tmp_path / "stopped.safetensors"
     code = (
         "import os, signal\n"
@@ -385,7 +385,7 @@ def test_ctrl_c_keeps_a_checkpoint_and_says_so(
 def _finish_with(
     monkeypatch: pytest.MonkeyPatch, trained: Path, meanwhile: Callable[[], object]
 ) -> None:
-    """Let training do something else to the files, and come out with what is trained already."""
+    """Let training change the files, and return an already trained predictor."""
     finished = LearnedBody.load(trained).predictor
 
     def train(*_: object, **__: object) -> CollisionPredictor | None:
@@ -527,7 +527,7 @@ def test_floating_point_operations_are_those_of_the_layers(trained: Path) -> Non
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["info", "models"])
 def test_describing_a_predictor_loads_no_torch(trained: Path, tmp_path: Path, command: str) -> None:
-    """Torch takes longer to import than all else that these commands do."""
+    """Importing torch takes longer than everything else that these commands do."""
     users = tmp_path / "lcollision" / "models"
     users.mkdir(parents=True)
     shutil.copy(trained, users / "tube.safetensors")

@@ -52,7 +52,7 @@ def test_a_pose_is_resolved_and_printed_as_stl(
     assert mesh.volume == pytest.approx(told["volume"], rel=1e-5)
     assert mesh.extents[2] == pytest.approx(60.0, abs=1e-4)
     assert mesh.bounds[0] == pytest.approx(0.0, abs=1e-4)
-    # It bends down as in its own file, not as the body lies that is encoded.
+    # It bends down as in its own file, not in the pose of the encoded body.
     shape = np.ptp(read_mesh(windmill).vertices, axis=0)
     assert mesh.extents == pytest.approx(shape * 60.0 / shape[2], rel=0.03)
     checked = lcollision("check", path, "--no-rules", "--json")
@@ -75,7 +75,7 @@ def test_a_3mf_says_its_unit_and_holds_the_same_solid(
     faces = [[int(t.get(f"v{n}")) for n in (1, 2, 3)] for t in model.iter(f"{CORE}triangle")]
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     assert mesh.is_volume
-    # The figure stands half a wall deep in its plate.
+    # The figure stands half a wall thickness deep in its base.
     assert mesh.extents[2] == pytest.approx(100.0 + 3.0 - 0.5, abs=1e-4)
     assert mesh.volume == pytest.approx(trimesh.load_mesh(paths[1]).volume, rel=1e-5)
     bottom = mesh.vertices[mesh.vertices[:, 2] == 0.0]
@@ -100,7 +100,7 @@ def test_the_front_of_a_character_is_towards_the_viewer_of_a_printer(
 def test_a_pose_that_is_not_freed_is_printed_with_exit_status_1(
     lcollision: Lcollision, windmill: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # No small body is known that Resolve cannot free: here it finds nothing.
+    # No small body is known that Resolve cannot free, so make it fail.
     monkeypatch.setattr(
         PoseResolver, "resolve", lambda _, latent, *__: SimpleNamespace(latent=latent)
     )

@@ -74,7 +74,7 @@ def model_file(model: LearnedBody, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture(scope="module")
 def helpless_file(editor_model: LearnedBody, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a model that knows no free pose."""
+    """Return a model without a known free pose."""
     path = tmp_path_factory.mktemp("model") / "helpless.safetensors"
     editor_model.save(path)
     return path
@@ -95,7 +95,7 @@ def poses(model: LearnedBody, colliding: np.ndarray, tmp_path: Path) -> Path:
 
 
 def colliding_mesh(model: LearnedBody, latent: np.ndarray, path: Path) -> np.ndarray:
-    """Write a mesh that lies somewhere else and is not quite what the model decodes."""
+    """Write a mesh with another placement, and with detail that the model does not decode."""
     generator = np.random.default_rng(1)
     detail = 2e-3 * model.body_size * np.sin(np.arange(model.n_vertices))[:, None]
     turned = (model.decode(latent) + detail) @ random_rotation(generator).T
@@ -164,7 +164,7 @@ def test_a_mesh_comes_back_in_its_place(
     assert np.array_equal(fixed.topology.faces, model.faces)
     assert n_pairs(model, fixed.vertices) == 0
     assert n_pairs(model, vertices) > 0
-    # Nearer than a wrong place or another order of vertices would be.
+    # Nearer than with a wrong placement or vertex order.
     assert np.linalg.norm(fixed.vertices - vertices, axis=1).mean() < 0.1 * model.body_size
 
 
@@ -546,7 +546,7 @@ main.main()
 
 
 def stopped(how: str, *arguments: object) -> str:
-    """Run a command, stop it by a signal once two poses are done, and return what it said."""
+    """Run a command, stop it by a signal once two poses are done, and return its output."""
     process = subprocess.run(
         [sys.executable, "-c", _STOP_AFTER_TWO, how, *map(str, arguments), "--workers", "1"],
         capture_output=True,
@@ -597,7 +597,7 @@ def test_a_stopped_run_replaces_nothing_and_goes_on(
 
 
 def contents(path: Path) -> dict[str, bytes]:
-    """Return the bytes of a file or of all files of a folder."""
+    """Return the bytes of a file, or of all files of a folder."""
     files = list(path.iterdir()) if path.is_dir() else [path]
     return {file.name if path.is_dir() else "": file.read_bytes() for file in files}
 
@@ -621,7 +621,7 @@ def test_what_another_run_left_is_neither_used_nor_lost(
     result = lcollision("resolve", model_file, poses, "-o", out)
     assert result.exit_code == 2
     assert f"{kept} is damaged; delete it" in result.stderr
-    # Renaming a part changes no result.
+    # Renaming a body part changes no result.
     kept.write_bytes(left)
     lcollision("domains", model_file, "--name", "1=somewhere")
     assert lcollision("resolve", model_file, poses, "-o", out).exit_code == 0
@@ -648,7 +648,7 @@ def test_a_full_disk_loses_nothing_of_what_an_earlier_run_left(
         full.setattr(job, "_SECONDS_BETWEEN_WRITES", -1.0)
         result = lcollision("resolve", model_file, poses, "-o", out, "--workers", "1")
     assert result.exit_code == 2
-    # Once for what is kept, and once for the output.
+    # Once for the stored progress, and once for the output.
     assert result.stderr.count("No space left") == 2
     assert "stopped" not in result.stderr
     assert kept.read_bytes() == left
@@ -671,7 +671,7 @@ def test_an_output_that_others_wrote_meanwhile_stays(
     poses: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As when the editor saves the poses that are being resolved in place."""
+    """For example, the editor saves the poses that are being resolved in place."""
     resolve_many = PoseResolver.resolve_many
 
     def save_then_resolve(self: PoseResolver, *arguments: Any, **options: Any) -> Any:

@@ -51,7 +51,7 @@ def test_random_poses_of_a_scene_are_written_body_by_body(
     first, second = (open_any(out / name).reference for name in ("hero.glb", "hero 2.glb"))
     rest = open_body(hero).reference
     assert np.abs(first - rest).max() > 0.1
-    # What is fixed is at rest, and a file of it has its own coordinates.
+    # A fixed body is at rest, and its file has its own coordinates.
     np.testing.assert_allclose(second, rest, atol=1e-6)
     scene_file = tmp_path / "scene.json"
     described = {"format": "lcollision-scene", "format_version": 1, "bodies": [{"file": str(hero)}]}

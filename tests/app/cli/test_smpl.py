@@ -1,4 +1,4 @@
-"""Body models and motions of the SMPL family through the command: collisions out, all else kept."""
+"""SMPL body models and motions through the command: collisions resolved, all else kept."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def counted_crossings(body: RigBody, motion: Arrays, frames: list[int]) -> list[int]:
-    """Return how many faces cross in frames of a file, by code that shares nothing with ours.
+    """Return how many counting faces cross in frames of a file, by independent code.
 
-    The frames are posed by the paper's equations, and pairs left out by docs/contact-rules.md.
+    The frames are posed by the paper's equations; the rules follow docs/contact-rules.md.
     """
     arrays, rig = smpl_arrays(), body.space.rig
     betas = motion["betas"][:10]
@@ -133,7 +133,7 @@ def test_motions_by_name_and_in_subfolders_are_as_a_folder(
     assert "joints.npy" in result.stderr
     assert "shape.npz" in result.stderr
     assert "were left out, which hold no motion that is read; save arrays by name" in result.stderr
-    # By a shell's pattern, whatever their shapes; results within the folder are no sources.
+    # By a shell's pattern, whatever their shapes; results within the folder are not inputs.
     named = [walks / "Subject1" / "walk.npz", walks / "Subject2" / "walk.npz"]
     result = lcollision("resolve", model, *named, "--motion", "-o", tmp_path / "two/", "--json")
     assert result.exit_code == 0, result.output
@@ -160,7 +160,7 @@ def test_a_motion_made_for_another_body_says_so(
     assert f"it was made for a male body ('gender'), and {name} is neutral" in result.stderr
     assert f"it was made for SMPLH ('surface_model_type'), and {name} is SMPLX" in result.stderr
     assert "left out: its facial expressions ('expressions')" in result.stderr
-    # A text that is pickled stays unread, and is no reason to refuse the turns.
+    # A pickled text stays unread, and is no reason to refuse the rotations.
     arrays["gender"] = np.array([b"male", None], dtype=object)
     arrays["surface_model_type"] = np.array(b"smplx_locked_head")
     np.savez(source, **arrays)
@@ -228,7 +228,7 @@ def test_what_cannot_be_is_said(lcollision: Lcollision, tmp_path: Path, model: P
         assert result.exit_code == 2
         assert said in result.stderr
     assert not out.exists()
-    # Of a motion of a body model that of its skeleton can be made.
+    # A body model's motion can be written as its skeleton's motion.
     skeleton = tmp_path / "out.bvh"
     assert lcollision("resolve", model, source, "--motion", "-o", skeleton).exit_code == 0
     assert skeleton.read_text().startswith("HIERARCHY")

@@ -1,4 +1,4 @@
-"""``lcollision upright``, and what commands say of which way is up."""
+"""``lcollision upright``, and the commands' reports on the up axis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The main job from end to end, by the commands that a user types, on real input."""
+"""The main workflow end to end, by the commands that a user types, on real input."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def test_colliding_poses_of_the_bundled_body_end_free(
 def test_scape_from_meshes_to_an_exported_pose(
     scape: PoseSet, lcollision: Lcollision, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A folder of scans, three commands to a model, and one of the scans moved free."""
+    """A folder of scans, three commands to a model, and one scan resolved."""
     folder = tmp_path / "scans"
     folder.mkdir()
     for number, vertices in enumerate(scape.vertices):
         write_mesh(folder / f"mesh{number:03}.obj", vertices, scape.topology.faces)
     model, store = tmp_path / "dancer.safetensors", tmp_path / "dancer.store"
-    # Two of the published poses run into themselves.
+    # Two of the published poses collide.
     scan, fixed = folder / "mesh007.obj", tmp_path / "fixed.obj"
     assert crossing_pairs(*read_obj(scan))
     steps = {
@@ -77,7 +77,7 @@ def test_scape_from_meshes_to_an_exported_pose(
     height = np.ptp(scape.vertices[0], axis=0).max()
     moved = np.linalg.norm(vertices - scape.vertices[7], axis=1)
     assert moved.mean() < 0.03 * height
-    # What was written is a pose set's mesh like any other.
+    # The written file is an ordinary mesh of a pose set.
     again = tmp_path / "again"
     again.mkdir()
     for number in range(3):

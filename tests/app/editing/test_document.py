@@ -1,4 +1,4 @@
-"""The document: every change is undone to the bit, and files hold what is on the screen."""
+"""The document: undo restores every change exactly, and files contain the pose on the screen."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ QUARTER_TURN = RigidTransform(
 
 
 def settle(qtbot: QtBot, document: PoseDocument) -> None:
-    """Wait until the frame and the verdict are those of the pose."""
+    """Wait until the frame and the verdict belong to the pose."""
     qtbot.waitUntil(lambda: document.motion.exact is not None and not document.tasks.busy)
     assert document.motion.frame is not None
     assert document.motion.frame.latent.tobytes() == document.history.latent.tobytes()
@@ -54,7 +54,7 @@ def test_the_frame_is_what_the_model_decodes_and_predicts(
     assert exact is not None
     assert frame.prediction is not None
     assert (frame.vertices == model.decode(colliding).astype(np.float32)).all()
-    # In a thread like the live one: torch's sums depend on how many share them.
+    # In a thread like the live one: torch's sums depend on the number of threads.
     with ThreadPoolExecutor(1, "one", keep_torch_to_one_thread, (model,)) as pool:
         predicted = pool.submit(model.predict, colliding).result()
     assert frame.prediction.collision_probability == predicted.collision_probability[0]
@@ -389,7 +389,7 @@ def test_resolve_checks_the_mesh_that_would_be_exported(
     qtbot: QtBot, document: PoseDocument, colliding: np.ndarray
 ) -> None:
     model = document.model
-    # So far away that rounding moves every vertex by much.
+    # So far away that rounding moves every vertex noticeably.
     far = RigidTransform(QUARTER_TURN.rotation, np.full(3, 1e8 * model.body_size))
     document.motion.load_pose(NamedPose("far", colliding, far))
     for domain in range(len(model.domain_names)):

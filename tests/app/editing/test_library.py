@@ -1,4 +1,4 @@
-"""The working pose and the library are two things: neither ever overwrites the other."""
+"""The working pose and the library are independent: neither overwrites the other."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def of_library(document: PoseDocument, name: str) -> NamedPose:
 
 
 def in_file(document: PoseDocument) -> dict[str, bytes]:
-    """Return what another editor that starts now would have as the library."""
+    """Return the library that another editor would read now."""
     document.tasks.wait_for_saves()
     other = PoseDocument(document.model)
     other.motion.set_solid(False)
@@ -253,7 +253,7 @@ def test_what_the_library_could_not_write_is_written_before_it_goes(
 def test_a_pose_that_nobody_touched_is_not_marked_changed(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
-    """Neither by loading nor by keeping; one that is nowhere else is."""
+    """Neither loading nor keeping it counts; a pose that is nowhere else is marked."""
     document.motion.load_pose(training_pose(document.model, 2))
     assert not document.history.modified
     document.library.add_pose("A")
@@ -272,7 +272,7 @@ def test_a_pose_that_nobody_touched_is_not_marked_changed(
     document.tasks.save(tmp_path / "pose.json")
     document.tasks.wait_for_saves()
     assert not document.history.modified
-    # A file is open now: what is loaded is not what the file holds.
+    # A file is open now: the loaded pose is not the file's.
     document.motion.load_pose(training_pose(document.model, 2))
     assert document.history.modified
     document.history.undo()
@@ -353,6 +353,6 @@ def test_the_fit_error_of_an_imported_mesh_is_kept_with_the_pose(
     document.tasks.save(tmp_path / "scan.json")
     document.tasks.wait_for_saves()
     assert read_poses(tmp_path / "scan.json", document.model)[0].fit_error_mean == 0.001
-    # What is changed is no longer what was fitted.
+    # The fit error does not apply to a changed pose.
     document.motion.set_code(0, 0.5)
     assert document.history.pose.fit_error_mean is None

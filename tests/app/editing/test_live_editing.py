@@ -1,4 +1,4 @@
-"""Drags, pins and solid edits: frames become the pose, one step of undo each, exact to the bit."""
+"""Drags, pins and solid edits: frames become the pose exactly, in one undo step each."""
 
 from __future__ import annotations
 
@@ -278,7 +278,7 @@ def test_another_edit_during_a_drag_is_a_step_of_its_own(qtbot: QtBot, solid: Po
         edit()
         assert not solid.motion.dragging
         held = solid.history.latent.tobytes()
-        # What the hand still does changes nothing.
+        # Further movements of the hand change nothing.
         solid.motion.drag_to(moved(solid, grip, 0.1))
         settle(qtbot, solid)
         assert solid.history.latent.tobytes() == held
@@ -511,7 +511,7 @@ def test_the_radius_of_grips_has_limits(document: PoseDocument) -> None:
 
 @pytest.fixture
 def seen(solid: PoseDocument) -> Iterator[list[tuple[bool, bool]]]:
-    """Yield of each shown frame whether it collides, by a check of its own, and has contacts."""
+    """Yield, for each shown frame, whether a separate check finds collisions, and has contacts."""
     shown: list[tuple[bool, bool]] = []
 
     def look() -> None:
@@ -620,7 +620,7 @@ def test_reset_all_is_one_step_that_takes_the_pins_and_says_what_stays(
         solid.motion.reset_all()
     assert told.args == ["Everything was reset except 1 locked body part: see Edit > Unlock all"]
     locked = solid.model.space.codes_of([0])
-    # Also with Solid on, there is no way on which something could stop it.
+    # Even with Solid on: the pose is set at once, so contact cannot stop it.
     assert not solid.motion.moving
     assert not solid.history.latent[~locked].any()
     assert (solid.history.latent[locked] == before[locked]).all()

@@ -113,14 +113,14 @@ def autosave(document: PoseDocument, tmp_path: Path) -> Iterator[Autosave]:
 
 
 def let_die(script: str, opened: Path, folder: Path) -> None:
-    """Kill an editor that a script makes of a file, once it says that it has written."""
+    """Kill an editor, run by a script on a file, once it reports its autosave."""
     editor = subprocess.Popen(
         [sys.executable, "-c", script, str(opened), str(folder)], stdout=subprocess.PIPE, text=True
     )
     try:
         assert editor.stdout is not None
         assert editor.stdout.readline() == "written\n"
-        # What a living editor holds is not lost.
+        # A running editor's session is not lost.
         assert find_lost_poses(folder) == []
     finally:
         editor.send_signal(signal.SIGKILL)
@@ -138,7 +138,7 @@ def test_a_killed_editor_loses_nothing_that_was_written(
     assert lost.pose_name == "kick"
     assert Path(lost.model) == model_file
     assert lost.file is None
-    # Another editor that starts now finds nothing: this one holds it.
+    # Another editor that starts now finds nothing: this one holds the session.
     assert find_lost_poses(folder) == []
 
     autosave = Autosave(document, folder, seconds=0.05)
@@ -150,7 +150,7 @@ def test_a_killed_editor_loses_nothing_that_was_written(
     assert [pose.name for pose in document.library.poses] == ["kick"]
     assert document.history.modified
     assert document.history.model_file == str(model_file)
-    # The session lives on until what is in it is saved.
+    # The session is kept until its contents are saved.
     assert lost.poses_file.is_file()
     document.tasks.save(tmp_path / "kick.json")
     document.tasks.wait_for_saves()
@@ -165,7 +165,7 @@ def test_what_cannot_be_read_stays_for_another_day(model_file: Path, tmp_path: P
     let_die(EDITOR, model_file, folder)
     (session,) = folder.iterdir()
     kept = (session / "session.json").read_text()
-    # As a disk that gives an error.
+    # Simulate a disk error.
     (session / "session.json").unlink()
     (session / "session.json").mkdir()
     assert find_lost_poses(folder) == []
@@ -174,7 +174,7 @@ def test_what_cannot_be_read_stays_for_another_day(model_file: Path, tmp_path: P
     (lost,) = find_lost_poses(folder)
     assert lost.pose_name == "kick"
     lost.session.discard()
-    # One without a pose is of no use.
+    # A session without a pose is useless.
     session.mkdir()
     (session / "session.json").write_text(kept)
     assert find_lost_poses(folder) == []
@@ -182,7 +182,7 @@ def test_what_cannot_be_read_stays_for_another_day(model_file: Path, tmp_path: P
 
 
 def test_an_editor_told_to_end_keeps_its_last_edit(document: PoseDocument, tmp_path: Path) -> None:
-    """Even one so young that it was not yet due to be written; without an edit, nothing is kept."""
+    """Even an edit that was not due to be written yet; without an edit, nothing is kept."""
     folder = tmp_path / "sessions"
     for edited in (False, True):
         if edited:
@@ -243,7 +243,7 @@ def test_save_after_a_recovery_sees_that_another_program_wrote_the_file(
     if end == "newer":
         write_poses(path, document.model, document.history.file_poses, document.history.pose)
     if end == "unknown":
-        # As an older program left it.
+        # A session of an older version.
         (session,) = folder.glob("*/session.json")
         held = json.loads(session.read_text())
         del held["file_stamp"]
@@ -370,7 +370,7 @@ def test_a_failing_disk_is_told_of_once(
 
 @pytest.fixture
 def swing(swing: Path, tmp_path: Path) -> Path:
-    """Return a file of its own of a character whose arm swings through its trunk."""
+    """Return a private copy of a character whose arm swings through its trunk."""
     return copyfile(swing, tmp_path / "swing.glb")
 
 
@@ -383,7 +383,7 @@ def opened(qtbot: QtBot, document: PoseDocument, swing: Path) -> Timeline:
 
 
 def edited_by_hand(document: PoseDocument, frame: int, by: float) -> Motion:
-    """Edit a frame of the motion that is open, and return that."""
+    """Edit a frame of the open motion, and return the motion."""
     document.timeline.go_to(frame)
     document.motion.set_code(10, float(document.history.latent[10]) + by)
     motion = document.timeline.motion
@@ -409,7 +409,7 @@ def test_a_killed_editor_loses_no_edit_of_a_motion(
     assert motion is not None
     assert read is not None
     assert (motion.name, timeline.frame, list(timeline.motions)) == (CLIP, 7, [CLIP, OTHER])
-    # The resolved spans, and the correction by hand over them.
+    # The resolved spans, with the correction by hand on top.
     (again,) = read_motions(open_body(swing), swing, CLIP)
     assert read.codes.tobytes() == again.codes.tobytes()
     check = document.model.exact_check()
@@ -418,11 +418,11 @@ def test_a_killed_editor_loses_no_edit_of_a_motion(
     assert check.are_free(motion.codes)[colliding].all()
     assert motion.codes[7, 10] == 0.25
     assert document.history.latent.tobytes() == motion.codes[7].tobytes()
-    # Nothing to undo, and all of it to export.
+    # There is nothing to undo, and everything to export.
     assert document.history.undo_stack.count() == 0
     assert document.history.modified
     assert timeline.changes == [(read, motion)]
-    # What goes on is kept as well, until it is exported.
+    # Further edits are kept as well, until they are exported.
     timeline.go_to(9)
     assert autosave.close(keep=True)
     (lost,) = find_lost_poses(folder)

@@ -1,4 +1,4 @@
-"""Files are written in the background: the window goes on, and what is written is what counts."""
+"""Files are written in the background: the window stays usable, and the written state counts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lcollision_core.bodies import read_pose_file, read_poses
 def hold(
     monkeypatch: pytest.MonkeyPatch, module: Any, write: Callable[..., Any]
 ) -> tuple[threading.Event, threading.Event]:
-    """Make writing wait; return what tells that it has begun, and what lets it go on."""
+    """Make writing wait; return events that signal its start and that let it continue."""
     begun, go_on = threading.Event(), threading.Event()
 
     def held(*arguments: Any) -> Any:

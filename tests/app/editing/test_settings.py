@@ -39,7 +39,7 @@ def test_every_setting_has_its_default_and_comes_back(store: QSettings) -> None:
         ("randomise_amount", "many"),
         ("randomise_amount", 17.0),
         ("screenshot_width", -5),
-        # As an older version allowed: more frames than memory may hold.
+        # Allowed by an older version: more frames than may fit into memory.
         ("turntable_seconds", 60.0),
     ],
 )
@@ -58,7 +58,7 @@ def test_recent_files_are_few_and_each_there_once(store: QSettings) -> None:
     settings = Settings(store)
     settings.remember_file("only")
     store.sync()
-    # A list of one comes back from an ini file as its item.
+    # QSettings returns a list of one from an ini file as its item.
     settings = Settings(QSettings(store.fileName(), QSettings.Format.IniFormat))
     assert settings["recent_files"] == ("only",)
     for number in range(20):

@@ -1,4 +1,4 @@
-"""The motion on the timeline: its playhead, its edits, what is known of its frames, Resolve."""
+"""The motion on the timeline: playhead, edits, checks of frames, Resolve."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def walk(document: PoseDocument, timeline: Timeline, tmp_path: Path) -> Path:
 
 
 def checked(qtbot: QtBot, timeline: Timeline) -> None:
-    """Wait until all frames are checked, and what lies between them."""
+    """Wait until all frames are checked, and the poses between them."""
     qtbot.waitUntil(lambda: timeline.checks.n_checked == len(timeline.checks.deepest))
     qtbot.waitUntil(lambda: bool(timeline.checks.checked_between[:-1].all()))
 
@@ -79,7 +79,7 @@ def test_drags_are_ready_before_all_frames_are_checked(
     document.tasks.start(Work.PREPARE, "Preparing drags", prepare, lambda _: None)
     try:
         timeline.check_again()
-        # Escape does not stop what makes drags ready.
+        # Escape does not stop preparing drags.
         document.tasks.cancel_all()
         qtbot.wait(300)
         assert timeline.checks.n_checked == 0
@@ -99,7 +99,7 @@ def test_all_frames_are_checked_as_the_exact_check_has_them(
     worst = int(np.argmax(timeline.checks.deepest))
     found = check.find(motion.vertices(worst, check))
     assert timeline.checks.deepest[worst] == found.penetration_depth.max()
-    # The parts that touch are the arm and what it touches.
+    # The colliding parts are the arm and those that it touches.
     deep = timeline.checks.parts[worst]
     assert deep.max() == np.float32(timeline.checks.deepest[worst])
     assert 2 <= np.count_nonzero(deep) < len(deep)
@@ -166,7 +166,7 @@ def test_a_pose_that_the_user_would_rather_save_stays(
     assert timeline.frame is None
     assert not timeline.playing
     assert not document.tasks.solving_motion
-    # Without an edit there is nothing to ask.
+    # Without an edit, nothing is asked.
     document.history.undo()
     timeline.go_to(3)
     assert (asked, timeline.frame) == ([way], 3)
@@ -201,7 +201,7 @@ def test_an_edit_by_hand_eases_in_and_out_and_is_one_step(
     assert edited.codes[20, code] == document.history.latent[code]
     assert document.history.pose.name == f"{CLIP} 20"
     assert document.history.modified
-    # What is known of the others stays known.
+    # The checks of the other frames stay valid.
     same = np.delete(np.arange(N_FRAMES), changed)
     assert timeline.checks.deepest[same].tobytes() == known[same].tobytes()
     timeline.go_to(40)
@@ -236,7 +236,7 @@ def test_with_solid_on_no_frame_round_an_edit_begins_to_collide(
     timeline.set_easing(3)
     timeline.go_to(frame)
     before = now(timeline)
-    # Towards the trunk, as far as contact lets it.
+    # Towards the trunk, as far as contact allows.
     aim = before.codes[frame] + 4.0 * (before.codes[first] - before.codes[frame])
     document.motion.edit("Move the arm", aim)
     qtbot.waitUntil(lambda: not document.motion.moving)
@@ -361,7 +361,7 @@ def test_playing_shows_frames_in_order_and_counts_what_it_leaves_out(
     assert shown == sorted(shown)
     steps = np.diff(shown)
     left_out = int((steps[steps > 0] - 1).sum())
-    # The last frame comes when the time is over, whatever was left out before it.
+    # The last frame comes at the end, however many frames were skipped before.
     assert timeline.playback.n_dropped <= left_out
     assert timeline.playback.n_dropped >= left_out - int(steps[-1])
     assert document.history.undo_stack.count() == 0
@@ -388,12 +388,12 @@ def test_the_motion_as_it_was_is_shown_beside_and_instead(
     assert original is not None
     timeline.go_to(21)
     was = document.model.decode(original.codes[21]).astype(np.float32)
-    # That of the frame before may come first.
+    # The previous frame's ghost may come first.
     qtbot.waitUntil(lambda: np.array_equal(document.history.ghost, was))
     timeline.compare(True)
     assert document.motion.frame is not None
     np.testing.assert_array_equal(document.motion.frame.vertices, was)
-    # One that is not computed yet comes as soon as it is there.
+    # A frame that is not computed yet is shown as soon as it is ready.
     timeline.compare(False)
     document.history.show_ghost(False)
     timeline.go_to(22)
@@ -432,7 +432,7 @@ def test_a_frame_of_the_pose_that_comes_late_does_not_take_the_place_of_what_is_
     assert another is not None
     motion.set_code(10, float(document.history.latent[10]) + 0.3)
     motion.show_instead(another)
-    # Nor does what is found of the pose take that of the verdict.
+    # Measuring the pose does not replace the verdict either.
     qtbot.waitUntil(lambda: motion.is_measured)
     assert motion.frame is another
     assert motion.exact is not None
@@ -448,7 +448,7 @@ def test_frames_round_the_playhead_show_through(qtbot: QtBot, timeline: Timeline
     timeline.set_onion(Onion(before=2, after=1, step=3))
     timeline.go_to(4)
     qtbot.waitUntil(lambda: len(timeline.onion_frames()) == 2)
-    # The second before the playhead would lie before the motion.
+    # The second frame before the playhead would be before the motion.
     assert sorted(by for by, _ in timeline.onion_frames()) == [-3, 3]
     timeline.go_to(20)
     qtbot.waitUntil(lambda: len(timeline.onion_frames()) == 3)
@@ -483,7 +483,7 @@ def test_a_resolve_that_is_cancelled_leaves_no_span_behind(
     before = now(timeline)
     timeline.go_to(2)
     timeline.resolve()
-    # As the worker does with frames that come out free.
+    # As the worker marks frames that it has freed.
     timeline.resolving._solved[3:6] = True
     assert range(3, 6) in timeline.resolving.spans
     document.tasks.cancel_all()
@@ -535,7 +535,7 @@ def test_the_clip_that_was_chosen_last_comes_and_an_edit_that_goes_on_stays_with
     timeline.choose(CLIP)
     timeline.opened.connect(lambda: came.append(now(timeline).name))
     done: list[object] = []
-    # One job after the other: by now the other clip would have come.
+    # Jobs run in order: by now the other clip would have arrived.
     timeline._reading.start("Waiting", lambda *_: 1, done.append)
     qtbot.waitUntil(lambda: bool(done))
     assert came == []
@@ -637,7 +637,7 @@ def test_pins_stay_on_their_patches_as_the_playhead_moves(
     document.pins.pin([grip], oriented=True)
     (there,) = document.history.pose.pins
     assert there.position == place(4)
-    # To frames that are not computed yet, then to those that are.
+    # Go to frames that are not computed yet, then to computed ones.
     for number in (24, 40, 24, 4):
         timeline.go_to(number)
         (pin,) = document.history.pose.pins
@@ -651,7 +651,7 @@ def test_pins_stay_on_their_patches_as_the_playhead_moves(
     qtbot.waitUntil(lambda: (timeline.frame or 0) > 8)
     timeline.pause()
     assert document.history.pose.pins[0].position == place(timeline.frame or 0)
-    # A pin is one step of undo wherever the playhead has gone, and nothing of the motion.
+    # A pin is one undo step wherever the playhead has gone, and does not edit the motion.
     assert document.history.undo_stack.count() == 1
     assert not document.history.modified
     timeline.choose(OTHER)
@@ -667,7 +667,7 @@ def test_a_resolve_of_the_frame_leaves_a_pinned_part_where_it_is(
     space, before = document.model.space, document.model.decode(document.history.latent)
 
     def moved() -> npt.NDArray[np.float64]:
-        """Return how far each body part is moved by a Resolve of the frame, which is undone."""
+        """Resolve the frame and undo it; return how far each body part was moved."""
         with qtbot.waitSignal(document.tasks.solve_finished, timeout=PATIENCE):
             document.tasks.resolve()
         assert document.model.exact_check().is_free(document.history.latent)
@@ -684,7 +684,7 @@ def test_a_resolve_of_the_frame_leaves_a_pinned_part_where_it_is(
 
 @pytest.fixture
 def bumpy(document: PoseDocument, tmp_path: Path) -> tuple[Path, npt.NDArray[np.float32]]:
-    """Return a file of frames that codes do not hold all of, which lie elsewhere, and those."""
+    """Return a file of displaced frames with detail that codes do not represent, and the frames."""
     from lcollision_core.files import PoseSet, write_pose_set
 
     model = document.model
@@ -750,7 +750,7 @@ def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
     places = [home(number)[40] for number in range(len(frames))]
     np.testing.assert_allclose(timeline.trail_points, places, atol=2e-6 * size)
     timeline.set_trail(None)
-    # A drag moves what is drawn: the patch goes from where it is seen to the pointer.
+    # A drag moves the drawn mesh: the patch moves from its drawn position to the pointer.
     document.motion.set_solid(False)
     grip = document.motion.grip_at(40)
     seen = grip.position(drawn())
@@ -764,7 +764,7 @@ def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
     kept = vertices - model.decode(latent)
     np.testing.assert_allclose(kept, home(2) - model.decode(motion.codes[2]), atol=3e-6 * size)
     assert document.history.pose.placement == motion.placement(2)
-    # As the motion has it in its file.
+    # As exported to the motion's file.
     edited, check = now(timeline), model.exact_check()
     np.testing.assert_allclose(edited.drawn(2, check), vertices, atol=2e-6 * size)
     place = edited.placement(2)

@@ -1,4 +1,4 @@
-"""The camera as a map from the scene to the picture and back, and what the mouse does to it."""
+"""The camera as a map from the scene to the picture and back, and its control by the mouse."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.fixture
 def view() -> View:
-    """Return a camera that looks at a point off the origin, from above and aside."""
+    """Return a camera that looks at a point off the origin, from above and from the side."""
     focus = np.array([0.3, -0.2, 1.1])
     return View(focus + np.array([1.5, -3.0, 0.8]), focus, UP)
 
@@ -67,7 +67,7 @@ def test_turning_keeps_the_distance_and_stays_upright_without_going_over_the_top
 
 
 def test_what_is_before_the_focus_follows_the_mouse(view: View) -> None:
-    """To the right as the mouse goes right, and down as it goes down."""
+    """It moves right and down with the mouse."""
     near = view.focus + 0.1 * (view.position - view.focus)
     before = places_of(view, near[None], SIZE)[0]
     for motion, way in (((5.0, 0.0), (1.0, 0.0)), ((0.0, 5.0), (0.0, 1.0))):
@@ -107,7 +107,7 @@ def test_a_camera_that_follows_stays_level_unless_the_body_leaves_the_picture() 
     np.testing.assert_allclose(step.focus - view.focus, [2.0, 0.0, -1.0], atol=1e-12)
     storey = followed(view, box, box + [2.0, 3.0, 0.0], 1, 1.2)
     np.testing.assert_allclose(storey.position - view.position, [2.0, 3.0, 0.0], atol=1e-12)
-    # Who looks at a hand alone has not asked for the whole body.
+    # A view of a hand is not changed to the whole body.
     near = View(view.position - 0.8 * (view.position - view.focus), view.focus, view.up)
     close = followed(near, box, box + [2.0, 3.0, 0.0], 1, 1.2)
     np.testing.assert_allclose(close.position - near.position, [2.0, 0.0, 0.0], atol=1e-12)

@@ -1,4 +1,4 @@
-"""How deep a drag leads: round a body in the way, by the wheel, and along an axis."""
+"""The depth of a drag: around the body, by the wheel, and along an axis."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def test_what_is_dragged_goes_before_the_body_and_stays_in_its_plane_beside_it(
 ) -> None:
     beside, before = depth.point(place(-1.0, -0.05, 0.1)), depth.point(place(0.1, -0.5, 0.1))
     np.testing.assert_allclose(beside, [-1.0, -0.05, 0.1], atol=1e-9)
-    # As far before the surface as the hand is thick, and a little more.
+    # In front of the surface by the hand's thickness, and a little more.
     assert 0.1 <= -0.5 - before[1] < 0.12
     np.testing.assert_allclose(places_of(VIEW, before[None], SIZE)[0], place(0.1, -0.5, 0.1))
 
 
 def test_it_begins_to_give_way_before_the_rim() -> None:
-    """A hand is wide: it would run into the side."""
+    """A hand is wide: it would collide with the side."""
     vertices = 0.5 * CORNERS
     nobody = np.zeros(8, dtype=np.bool_)
     depth = DragDepth(VIEW, SIZE, np.array([-1.5, 0.45, 0.0]), vertices, FACES, nobody, 1.0)
@@ -58,7 +58,7 @@ def test_the_wheel_takes_over(depth: DragDepth) -> None:
     before = depth.point(over)
     depth.shift(over, 0.3)
     assert depth.point(over)[1] == pytest.approx(before[1] + 0.3)
-    # Neither on the body nor beside it does anything else change that.
+    # Nothing else changes the depth, on the body or beside it.
     assert depth.point(place(-0.8, 0.0, 0.0))[1] == pytest.approx(before[1] + 0.3)
 
 

@@ -1,4 +1,4 @@
-"""The floor: beneath the body, or where it was laid whatever the body does."""
+"""The floor: beneath the body, or fixed at a height."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_neither_floor_nor_shadow_is_seen_from_below(renderer: PoseRenderer) -> 
     scene, model = renderer.scene, RigBody.of(rigged_tube())
     vertices = model.reference.astype(np.float32)
     pictures = []
-    # Without the body, which hides what is beneath it.
+    # Without the body, which hides the floor beneath it.
     scene.show(vertices, vertex_normals(vertices, model.faces))
     scene.body.SetVisibility(False)
     for side in (1.0, -1.0):

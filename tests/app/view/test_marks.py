@@ -1,4 +1,4 @@
-"""What stands over the body: the patch that would be taken, pins, contacts."""
+"""Marks over the body: the patch under the pointer, pins, contacts."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_the_patch_is_painted_where_it_is_and_nowhere_else(
     painted = changed(before, steady_pixels(qtbot, viewport))
     column, row = _places(viewport, scene.surface.vertices[[vertex]])[0].astype(int)
     assert painted[row - 2 : row + 3, column - 2 : column + 3].all()
-    # All of it within the patch, with the width of the rim.
+    # The mark is within the patch, extended by the width of the rim.
     rows, columns = np.nonzero(painted)
     inside = _places(viewport, scene.surface.vertices[grip.vertices])
     for drawn, seen in ((columns, inside[:, 0]), (rows, inside[:, 1])):
@@ -61,7 +61,7 @@ def test_pins_and_contacts_have_one_size_near_and_far_and_are_drawn_through_the_
     renderer = PoseRenderer(editor_model, SIDE, SIDE, LIGHT)
     scene, vertices = renderer.scene, editor_model.reference
     scene.show(vertices, np.zeros_like(vertices))
-    # Inside the body, where only what is drawn through it is seen.
+    # Inside the body, where only marks drawn through it are visible.
     middle = vertices.mean(axis=0, dtype=np.float64)[None]
     nothing = np.zeros((0, 3))
     front = preset_view("Front", vertices, editor_model.up_axis, editor_model.front, 1.0)

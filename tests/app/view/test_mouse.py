@@ -1,4 +1,4 @@
-"""The camera and the mouse in a viewport: turned, zoomed, clicked, and drawn meanwhile."""
+"""The camera and the mouse in a viewport: turning, zooming, clicking, and drawing meanwhile."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_the_pointer_names_the_domain_beneath_it(qtbot: QtBot, viewport: Viewpor
     assert viewport.canvas is not None
     told: list[int | None] = []
     viewport.domain_hovered.connect(told.append)
-    # A pointer that is there already, from a test before, would not move.
+    # A pointer that is already there, from an earlier test, would not move.
     point_beside(qtbot, viewport)
     places = [place_of(viewport, seen_vertex(viewport, domain)) for domain in (0, 1)]
     for domain, place in zip((0, 1, None), (*places, QPoint(3, 3)), strict=True):
@@ -72,7 +72,7 @@ def test_each_camera_shows_the_whole_body(viewport: Viewport) -> None:
 def test_who_sees_the_whole_body_goes_on_seeing_it(
     qtbot: QtBot, document: PoseDocument, viewport: Viewport, closely: bool
 ) -> None:
-    """But who looks at a part of it is left in peace."""
+    """But a view of a part of it is not changed."""
     model, scene = document.model, viewport.scene
     assert scene is not None
     straight, bent = (
@@ -85,7 +85,7 @@ def test_who_sees_the_whole_body_goes_on_seeing_it(
     document.motion.load_pose(bent)
     rest(qtbot, viewport)
     vertices, up = scene.surface.vertices.copy(), np.eye(3)[model.up_axis]
-    # As narrow as the bent tube allows, so that the straight one does not fit; or narrower.
+    # Just wide enough for the bent tube, so that the straight one does not fit; or narrower.
     near = framing(vertices, np.array([0.3, 0.0, 1.0]), up, 1.0)
     share = 0.3 if closely else 0.9
     scene.view = View(near.focus + share * (near.position - near.focus), near.focus, near.up)
@@ -135,7 +135,7 @@ def test_the_wheel_zooms_at_the_pointer(
     assert nearer == pytest.approx(1.15 ** -sum(steps), rel=0.02)
     sights = [view.focus - view.position for view in (before, after)]
     np.testing.assert_allclose(*(sight / np.linalg.norm(sight) for sight in sights), atol=1e-6)
-    # What turning goes round is as deep in the scene as the body.
+    # The centre of rotation is as deep in the scene as the body.
     depths = (scene.surface.vertices - after.position) @ (sights[1] / np.linalg.norm(sights[1]))
     assert depths.min() - 1e-6 <= np.linalg.norm(sights[1]) <= depths.max() + 1e-6
 
@@ -221,11 +221,11 @@ def test_a_drag_is_smooth_until_pictures_are_slow_and_again_once_they_are_fast()
     assert smoothness.while_moving
     for seconds in (0.2, 0.030, 0.005, 0.030, 0.030):
         smoothness.note(seconds)
-        # One slow picture, or two, may be another program's fault.
+        # One or two slow pictures may be caused by another program.
         assert smoothness.while_moving
     smoothness.note(0.030)
     assert not smoothness.while_moving
-    # Not to and fro: neither a little faster nor a little slower changes it.
+    # There is hysteresis: slightly faster or slower pictures change nothing.
     for seconds in (0.018, 0.015, 0.022, 0.013):
         smoothness.note(seconds)
         assert not smoothness.while_moving
@@ -260,13 +260,13 @@ def test_the_canvas_draws_a_drag_as_smoothly_as_the_machine_can(
     assert all(drag())
     monkeypatch.setattr("app.view.canvas._SLOW_SECONDS", 0.0)
     monkeypatch.setattr("app.view.canvas._FAST_SECONDS", 0.0)
-    # However long a busy machine draws a picture, this is no rest.
+    # However long a busy machine draws a picture, this does not count as rest.
     at_rest = canvas._rest.interval()
     canvas._rest.setInterval(1_000_000)
     assert not any(drag()[4:])
     canvas._rest.start(at_rest)
     rest(qtbot, viewport)
-    # At rest it is smooth whatever that takes.
+    # At rest, the picture is smooth whatever its time.
     assert canvas.is_smooth
     monkeypatch.setattr("app.view.canvas._FAST_SECONDS", 1e3)
     document.motion.set_code(0, 0.3)
@@ -292,7 +292,7 @@ def drag(
     keys: Qt.KeyboardModifier = NO_KEY,
     let_go: bool = True,
 ) -> None:
-    """Drag with a button, in a few steps, and rest until what is dragged has arrived."""
+    """Drag with a button, in a few steps, and wait until the dragged patch has arrived."""
     canvas = viewport.canvas
     assert canvas is not None
     QTest.mousePress(canvas, button, keys, start)
@@ -347,7 +347,7 @@ def test_the_mouse_turns_and_shifts_the_camera(
 
 
 WAY = QPoint(0, 20)
-"""In pixels, where the tube's first body part can follow."""
+"""A drag in pixels that the tube's first body part can follow."""
 
 
 def test_the_patch_that_is_dragged_follows_the_pointer_in_one_step_of_undo(
@@ -356,7 +356,7 @@ def test_the_patch_that_is_dragged_follows_the_pointer_in_one_step_of_undo(
     canvas, scene, document = viewport.canvas, viewport.scene, viewport._document
     assert canvas is not None
     assert scene is not None
-    # Half of a tube goes nowhere alone.
+    # Half of a tube cannot move alone.
     document.motion.standing, document.motion.whole_body = False, True
     vertex = seen_vertex(viewport, 0)
     before, camera = document.history.latent, scene.view.position
@@ -376,7 +376,7 @@ def test_the_patch_that_is_dragged_follows_the_pointer_in_one_step_of_undo(
     points += [targets[-1], grip.position(scene.surface.vertices)]
     places = places_of(scene.view, np.array(points), (canvas.width(), canvas.height()))
     np.testing.assert_allclose(places[1] - places[0], [WAY.x(), WAY.y()], atol=0.1)
-    # The tube goes as far that way as it can.
+    # The tube moves as far in that direction as it can.
     assert np.linalg.norm(places[2] - places[1]) < 0.8 * WAY.manhattanLength()
     np.testing.assert_array_equal(scene.view.position, camera)
     name = document.model.domain_names[0]
@@ -397,7 +397,7 @@ def test_escape_in_a_drag_puts_everything_back_to_the_bit(qtbot: QtBot, viewport
     QTest.keyClick(canvas, Qt.Key.Key_Escape)
     assert not document.motion.dragging
     np.testing.assert_array_equal(document.history.latent, before)
-    # What the hand still does changes nothing.
+    # Further movements of the hand change nothing.
     QTest.mouseMove(canvas, place + QPoint(40, 0))
     QTest.mouseRelease(canvas, LEFT, NO_KEY, place + QPoint(40, 0))
     settled(qtbot, viewport)
@@ -406,7 +406,7 @@ def test_escape_in_a_drag_puts_everything_back_to_the_bit(qtbot: QtBot, viewport
 
 
 def test_a_drag_ends_with_its_model(qtbot: QtBot, viewport: Viewport) -> None:
-    """The patch that is held may have vertices that the next model does not."""
+    """The held patch may have vertices that the next model lacks."""
     canvas, document = viewport.canvas, viewport._document
     assert canvas is not None
     place = place_of(viewport, seen_vertex(viewport, 1))
@@ -492,7 +492,7 @@ def test_a_double_click_pins_and_unpins_and_a_pin_is_dragged_by_its_dot(
     assert "pin" in document.history.undo_stack.undoText().casefold()
     dot_before = dot()
     double_click(canvas, dot())
-    # Or QTest takes the button for pressed in later tests.
+    # Otherwise QTest considers the button pressed in later tests.
     QTest.mouseRelease(canvas, LEFT, NO_KEY, dot_before)
     assert document.history.pose.pins == ()
     settled(qtbot, viewport)
@@ -518,7 +518,7 @@ def test_no_pin_is_found_that_is_gone_since_the_last_picture(
 def test_keys_do_nothing_in_the_view(qtbot: QtBot, viewport: Viewport) -> None:
     canvas = viewport.canvas
     assert canvas is not None
-    # Off the body, or the part under the pointer may light up a moment later.
+    # Move off the body, or the part under the pointer may be highlighted a moment later.
     QTest.mouseMove(canvas, QPoint(2, 2))
     qtbot.waitUntil(lambda: viewport.hovered_domain is None, timeout=20_000)
     canvas.setFocus()

@@ -1,4 +1,4 @@
-"""The outline of a body part: its border on the mesh, whatever the mask is like."""
+"""The outline of a body part: its border on the mesh, for any mask."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def test_a_border_goes_round_where_one_part_hands_over_to_the_other(
     mask, faces = editor_model.attention_mask, editor_model.faces
     shape = PartShape.of(mask, faces, domain)
     assert len(shape.segments) > 0
-    # On a closed mesh it has no ends: each point is on two pieces.
+    # On a closed mesh it has no ends: each point is on two segments.
     assert (np.bincount(shape.segments.ravel()) == 2).all()
     assert (shape.fractions > 0.0).all()
     assert (shape.fractions < 1.0).all()
     leads = mask.argmax(axis=0)
     part = np.flatnonzero(leads == domain)
-    # Smoothing moves the border by a vertex at most here and there.
+    # Smoothing moves the border by at most a vertex in places.
     assert np.isin(shape.vertices, part).mean() > 0.9
     assert np.isin(part, shape.vertices).mean() > 0.7
     vertices = editor_model.reference.astype(np.float32)

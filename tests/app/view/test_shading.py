@@ -1,4 +1,4 @@
-"""Colours: what each says, that equal steps look equal, and that colour-blind eyes tell them."""
+"""Colours: their meaning, equal steps that look equal, and colour-blind safety."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_an_unknown_energy_is_plain_and_says_so(shader: Shader) -> None:
         legend = shader.legend(shading, Known())
         assert legend.title
         assert legend.note
-        # The scale is there before its numbers are, or the legend would grow as they come.
+        # The scale is shown before its numbers, so that the legend does not grow.
         assert legend.ramp
     assert "does not predict" in shader.legend(Shading.PREDICTED, Known(), has_predictor=False).note
 
@@ -123,7 +123,7 @@ def test_every_step_of_a_scale_looks_alike(shader: Shader) -> None:
     for colours in ramps(shader):
         lab = np.array([cielab(colour) for colour in colours[::15]])
         steps = np.linalg.norm(np.diff(lab, axis=0), axis=1)
-        # Across one of its corners the straight way is shorter.
+        # Across one of its corners the straight path is shorter.
         assert steps.max() < 2.0 * steps.min()
 
 

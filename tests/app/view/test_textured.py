@@ -1,4 +1,4 @@
-"""The body as it looks: its pixels, drawn off the screen."""
+"""The body with its textures: pixels rendered off-screen."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Draw = Callable[..., "Drawn"]
 
 
 class Drawn:
-    """The front of the cube, seen from before it."""
+    """A picture of the cube's front."""
 
     def __init__(self, model: RigBody) -> None:
         self.model = model
@@ -54,7 +54,7 @@ class Drawn:
         self.scene.view = View(np.array([0.0, 0.0, 12.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
 
     def at(self, x: float, y: float, z: float = 1.0) -> list[int]:
-        """Return the colour where a point of the scene is seen."""
+        """Return the colour at a point of the scene."""
         drawn = np.asarray(self.renderer.drawn())
         place = self._place(x, y, z)
         return drawn[place[1], place[0], :3].astype(int).tolist()
@@ -89,7 +89,7 @@ def draw(tmp_path: Path) -> Iterator[Draw]:
 def laid(
     sampler: dict[str, int] | None = None, image: npt.NDArray[np.uint8] = FOUR, **transform: Any
 ) -> tuple[dict[str, Any], GltfBuilder]:
-    """Return a material of an image, moved by `transform`, and what holds it."""
+    """Return a material of an image, moved by `transform`, and the builder that contains it."""
     builder = GltfBuilder()
     index = add_texture(builder, png(image), SHARP | (sampler or {}))
     moved = {"KHR_texture_transform": transform} if transform else {}
@@ -123,7 +123,7 @@ def test_a_pose_takes_its_texture_along(draw: Draw) -> None:
 @pytest.mark.parametrize(
     ("wrap", "expected"),
     [
-        # From left to right: twice the width of the image, and what is beyond it.
+        # From left to right: twice the width of the image, and beyond it.
         ((10497, 10497), [RED, GREEN, RED, GREEN]),
         ((33648, 10497), [RED, GREEN, GREEN, RED]),
         ((33071, 10497), [RED, GREEN, GREEN, GREEN]),
@@ -154,7 +154,7 @@ def test_a_smooth_image_blends_where_a_sharp_one_does_not(draw: Draw) -> None:
 def test_a_fine_image_is_averaged_only_where_its_sampler_has_it_so(
     draw: Draw, filtering: int, fine: bool
 ) -> None:
-    # Stripes of one pixel, far narrower than those of the screen.
+    # Stripes of one pixel, far narrower than the screen's pixels.
     image = np.tile(FOUR[:1], (1, 512, 1))
     front = draw(*laid({"minFilter": filtering, "magFilter": 9729}, image))
     reds = [front.at(x, 0.0)[0] for x in np.linspace(-0.8, 0.8, 15)]
@@ -195,7 +195,7 @@ def test_the_inside_is_seen_of_what_has_two_sides(draw: Draw, double: bool) -> N
     image = np.full((1, 1, 4), 255, dtype=np.uint8)
     image[..., :3] = BLUE
     builder = GltfBuilder()
-    # All faces but the front are there: one looks inside.
+    # All faces except the front are drawn: the view is inside.
     material = coloured(baseColorFactor=[0.0, 0.0, 1.0, 1.0]) | {"doubleSided": double}
     alpha = np.ones((24, 4))
     alpha[:4, 3] = 0.0
@@ -209,7 +209,7 @@ def test_colours_of_vertices_are_those_of_the_screen(draw: Draw) -> None:
     builder = GltfBuilder()
     colours = builder.array(np.repeat([[0.5, 0.0, 0.0], [0.0, 0.5, 0.0]] * 3, 4, axis=0))
     front = draw(coloured(), builder, COLOR_0=colours)
-    # Half of the light is 188 of 255 on a screen.
+    # Half the light is 188 of 255 in sRGB.
     assert front.at(0.0, 0.0) == [188, 0, 0]
 
 

@@ -1,4 +1,4 @@
-"""Turntables: size, rate, background and format, and the form that asks for them."""
+"""Turntables: size, rate, background and format, and their form."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.one_window
 
 
 def video(qtbot: QtBot, window: MainWindow, path: Path, style: TurntableStyle) -> Path:
-    """Make a turntable video, and return what has been written."""
+    """Make a turntable video, and return the path of the written file."""
     written = path.with_suffix("") if path.suffix == ".png" else path
     with qtbot.waitSignal(
         window.document.message,
@@ -47,7 +47,7 @@ def test_a_video_goes_round_once_in_the_size_and_the_time_asked_for(
             frames.append(np.asarray(image.convert("RGB"), dtype=int))
             lasting += image.info["duration"]
     assert lasting == 500
-    # Each frame is another: the last is not the first again.
+    # All frames differ: the last is not the first again.
     assert min(np.abs(frame - frames[0]).mean() for frame in frames[1:]) > 0
     assert [entry.name for entry in tmp_path.glob("turn*")] == [path.name]
 

@@ -1,4 +1,4 @@
-"""The viewport in a real window: what is drawn, what the mouse says, and what is left behind."""
+"""The viewport in a real window: drawing, mouse events, and clean-up."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_a_highlight_outlines_its_domain_and_leaves_all_colours_as_they_are(
     assert viewport.legend == legend
     drawn = changed(before, pixels(viewport))
     assert drawn.sum() > 100
-    # A line, no wash: the part itself is as it was.
+    # An outline, no tint: the part itself is unchanged.
     leads = document.model.attention_mask.argmax(axis=0)
     places = [place_of(viewport, vertex) for vertex in np.flatnonzero(leads == 1)]
     assert np.mean([drawn[place.y(), place.x()] for place in places]) < 0.5
@@ -197,7 +197,7 @@ def test_an_outline_follows_the_pose_and_the_camera_in_one_width(
     assert (bent & ~behind).any()
     view = scene.view
     scene.view = View(view.focus + 0.5 * (view.position - view.focus), view.focus, view.up)
-    # From half as far a line is twice as long at most, and no wider.
+    # From half the distance, a line is at most twice as long, and no wider.
     assert outlined().sum() < 2.5 * behind.sum()
 
 
@@ -214,7 +214,7 @@ def test_each_shading_looks_different_and_explains_itself(
         viewport.set_shading(shading)
         rest(qtbot, viewport)
         assert bool(viewport.legend.title) == (shading is not Shading.PLAIN)
-        # Where there is nothing to explain, the picture fills the view.
+        # Without a legend, the picture fills the view.
         filled = viewport.canvas.geometry() == viewport.rect()
         assert filled == (shading is Shading.PLAIN)
         seen.append(pixels(viewport))
@@ -225,7 +225,7 @@ def test_each_shading_looks_different_and_explains_itself(
 
 
 class LegendWatch(QObject):
-    """Notes what happens to a legend while its canvas paints, and at other times."""
+    """Records events of a legend while its canvas paints, and at other times."""
 
     def __init__(self, viewport: Viewport) -> None:
         super().__init__(viewport)
@@ -251,7 +251,7 @@ class LegendWatch(QObject):
 
 
 def test_the_legend_is_laid_out_while_nothing_is_painted(qtbot: QtBot, viewport: Viewport) -> None:
-    """A widget that is shown while the canvas paints may resize it: Qt frees what is drawn into."""
+    """A widget shown while the canvas paints may resize it: Qt frees the buffer being drawn."""
     watch = LegendWatch(viewport)
     viewport.resize(SIDE - 60, SIDE)
     for shading in (Shading.EXACT, Shading.PLAIN, Shading.EXACT):
@@ -305,7 +305,7 @@ def test_what_resolve_has_moved_is_drawn_and_explained(
     plain = scene.surface.colours.copy()
     assert (plain == plain[0]).all()
     before = scene.surface.vertices.copy()
-    # It is told whether or not the ghost is drawn.
+    # It is reported whether or not the ghost is drawn.
     document.history.show_ghost(False)
     with qtbot.waitSignal(document.tasks.solve_finished, timeout=20_000):
         document.tasks.resolve()
@@ -545,7 +545,7 @@ def test_a_closed_viewport_leaves_no_vtk_object_no_timer_and_no_thread(
         assert not isValid(shown)
         return n_alive
 
-    # The first window makes what all windows share.
+    # The first window creates objects that all windows share.
     show_and_close()
     before = vtk_objects()
     assert show_and_close() > len(before) + 20
@@ -590,5 +590,5 @@ def test_nothing_stands_for_the_surface_of_a_context_that_is_gone(
     context.aboutToBeDestroyed.connect(lambda: held.append(isValid(surface)))
     assert isValid(surface)
     dispose(viewport)
-    # It was forgotten before Qt deleted it.
+    # It was released before Qt deleted it.
     assert held == [False]
