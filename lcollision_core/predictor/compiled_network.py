@@ -1,8 +1,8 @@
 """The default network on the CPU: compiled loops in single precision, without torch.
 
-`GeometricNetwork` spends most of a single pose's time on passing from one operation of torch to the
-next, and a program that only drags sliders would spend seconds on importing it. Here the same
-network is computed by compiled loops, and back again for the gradients.
+For a single pose, `GeometricNetwork` spends most of its time on the overhead of torch's operations,
+and a program that only drags sliders would spend seconds on importing torch. Here compiled loops
+compute the same network, and its gradients by a backward pass.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ N_POINTS = 240
 
 
 def body_points(embedding: Embedding, n_points: int = N_POINTS) -> npt.NDArray[np.int64]:
-    """Return (P,) ascending vertices all over the body, a function of the embedding alone.
+    """Return (P,) ascending vertices spread over the body, which depend only on the embedding.
 
     Parameters
     ----------
     embedding : of the body
-    n_points : fewer for a mesh with fewer used vertices
+    n_points : P, or the number of used vertices if that is less
     """
     rest, topology = embedding.rest_vertices, embedding.topology
     used = np.setdiff1d(np.arange(len(rest)), topology.unused_vertices)
@@ -45,9 +45,9 @@ def body_points(embedding: Embedding, n_points: int = N_POINTS) -> npt.NDArray[n
 
 
 def farthest_points(positions: FloatArray, first: int, n_points: int) -> npt.NDArray[np.int64]:
-    """Choose some of (n, 3) positions, each farthest from those before it.
+    """Return the indices of a farthest-point sampling of (n, 3) positions.
 
-    When all are chosen, the first is repeated.
+    Once all are chosen, the first is repeated.
     """
     chosen = [first]
     nearest = np.linalg.norm(positions - positions[first], axis=1)
@@ -59,10 +59,10 @@ def farthest_points(positions: FloatArray, first: int, n_points: int) -> npt.NDA
 
 
 def neighbour_order(positions: FloatArray, block: int) -> npt.NDArray[np.int32]:
-    """Order (n, 3) positions so that each block of so many in turn lies close together.
+    """Order (n, 3) positions so that successive blocks of `block` positions are compact.
 
-    They are halved across their longest extent, and the halves likewise. The last one is
-    repeated to fill its block.
+    They are split in half along their longest extent, recursively. The last one is repeated to fill
+    its block.
     """
 
     def ordered(index: npt.NDArray[np.intp]) -> list[npt.NDArray[np.intp]]:
@@ -86,7 +86,7 @@ def skin_graph(embedding: Embedding) -> sparse.csr_matrix:
 def skin_distances(
     graph: sparse.csr_matrix, vertex: npt.NDArray[np.integer], limit: float = np.inf
 ) -> FloatArray:
-    """Return (n, V) lengths of the shortest edge paths from some vertices, in normalised length.
+    """Return (n, V) normalised lengths of the shortest edge paths from n vertices.
 
     They are infinite between components, and beyond the limit.
     """
@@ -95,9 +95,9 @@ def skin_distances(
 
 
 def skin_cells(embedding: Embedding, centre: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
-    """Return (V,) which of some vertices each is nearest to along the surface, -1 if there is none.
+    """Return (V,) the index of the centre nearest to each vertex along the surface, -1 without any.
 
-    A component without any of them, such as an eye, is reached from its neighbour.
+    A component without a centre, such as an eye, is reached from its neighbour.
     """
     rest = embedding.rest_vertices
     if not len(centre):
@@ -108,7 +108,7 @@ def skin_cells(embedding: Embedding, centre: npt.NDArray[np.integer]) -> npt.NDA
 
 
 def tangent_frames(embedding: Embedding, vertex: npt.NDArray[np.integer]) -> FloatArray:
-    """Return (P, 3, 3): columns normal and two tangents of the reference at some vertices."""
+    """Return (P, 3, 3) frames at vertices of the reference: columns normal and two tangents."""
     normal = vertex_normals(embedding.rest_vertices, embedding.topology.faces)[vertex]
     normal[~normal.any(axis=1)] = [1.0, 0.0, 0.0]
     axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
@@ -128,8 +128,8 @@ class CodeGroup(NamedTuple):
 
     Attributes
     ----------
-    codes : which of the D codes
-    table : (codes, 9 n) float32 array, to the outputs of the n points that it moves
+    codes : the group's codes, of D
+    table : (codes, 9 n) float32 array, to the outputs of the n points that they move
     """
 
     codes: slice
@@ -138,21 +138,21 @@ class CodeGroup(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SkinGeometry:
-    """The points of the body and the fold sites: a function of the embedding and the sites.
+    """The points of the body and the fold sites, which depend on the embedding and the sites.
 
     Attributes
     ----------
     point_vertices : (P,) int64 array, ascending, the vertices that are points of the body
-    members : (S, M) int32 array, each site's vertices as numbers of the skin
+    members : (S, M) int32 array, each site's vertices as indices into the skin
     geodesic_neighbours : (P, P) float32 array, added to squared distances: 1 for pairs so near
         along the surface that they do not count in each other's field, else 0
-    order : (O,) int32 array, all points of the body, neighbours near each other, and the last
-        again until O is a multiple of `BLOCK`
+    order : (O,) int32 array, all points of the body, with neighbours near each other; the last is
+        repeated until O is a multiple of `BLOCK`
     neighbour_blocks : `geodesic_neighbours` in that order, see `in_blocks`
-    rest_frame : (N, 3, 3) float32 array: of the first N points of the skin, on the reference, as
-        columns, the outer normal first; the skin is the P points, then the sites' centres that are
-        none, and last their other vertices, which need no frame
-    groups : of codes; their outputs follow each other, nine for each point that they move
+    rest_frame : (N, 3, 3) float32 array, frames of the first N points of the skin on the reference,
+        as columns, the outer normal first; the skin is the P points, then the other centres of
+        sites, then the sites' other vertices, which need no frame
+    groups : groups of codes; their outputs follow each other, nine for each point that they move
     target : (T,) int32 array, the point of the skin that nine outputs belong to
     offset : (Q, 9) float32 array, deformation features of codes 0
     scale : (9,) float32 array, of the outputs
@@ -183,7 +183,7 @@ class SkinGeometry:
         Parameters
         ----------
         embedding : of the body
-        sites : (S, M) vertices about each fold site, see `find_fold_sites`
+        sites : (S, M) vertices around each fold site, see `find_fold_sites`
         n_points : P, unless the mesh has fewer vertices
 
         Raises
@@ -230,12 +230,12 @@ class PosedSkin(NamedTuple):
 
     Attributes
     ----------
-    frame : (B, N, 3, 3) of the first N points of the skin, as columns
+    frame : (B, N, 3, 3) local frames of the first N points of the skin, as columns
     positions : (B, 3, P) of the points of the body, in normalised length
-    field : (P, B, 2, 8) contact features, see `geometric.field.ContactField`
-    folds : (S, B, 9 M) the deformation about the fold sites
-    outputs, features, turns, rows : what the derivatives need: (B, T, 9) tanh of each group's
-        outputs, (B, Q, 9) deformation features, those of `kernels.rodrigues`, and
+    field : (P, B, 2, 8) contact features, see `geometric_network.ContactField`
+    folds : (S, B, 9 M) the deformation around the fold sites
+    outputs, features, turns, rows : needed for the derivatives: (B, T, 9) tanh of each group's
+        outputs, (B, Q, 9) deformation features, the result of `kernels.rodrigues`, and
         (B, 3, Q, 3) rows of the deformation gradients
     """
 
@@ -256,14 +256,14 @@ class CompiledSkin:
     ----------
     geometry : the points of the body
     weight : (3 P, P) float32 array, from the points' deformation gradients to their positions
-    origin : (3, P) of the positions, in normalised length
+    origin : (3, P) offset of the positions, in normalised length
     """
 
     def __init__(self, geometry: SkinGeometry, weight: Float32Array, origin: Float32Array) -> None:
         self._geometry, self._weight, self._origin = geometry, weight, origin
 
     def forward(self, codes: Float32Array, workspace: Workspace) -> PosedSkin:
-        """Pose the skin by (B, D) codes, in a workspace's memory."""
+        """Pose the skin by (B, D) codes, in the memory of a workspace."""
         geometry, n_rows, empty = self._geometry, len(codes), workspace.empty
         (n_skin, _), (n_sites, n_members) = geometry.offset.shape, geometry.members.shape
         outputs = empty("outputs", n_rows, N_FEATURES * len(geometry.target))
@@ -333,10 +333,10 @@ State = Mapping[str, npt.NDArray[Any]]
 Array = npt.NDArray[np.float32]
 
 SQUASHED = 4.0
-"""A patch's logit is divided by this and squashed before the head sees it."""
+"""Divisor of a patch's logit before tanh, whose result is an input of the head."""
 
 _ROWS_AT_ONCE = 64
-"""Poses that are computed together: their arrays, half a megabyte a pose, stay in the caches."""
+"""Poses computed together: their arrays, half a megabyte per pose, stay in the caches."""
 
 
 class CompiledNetwork:
@@ -349,7 +349,7 @@ class CompiledNetwork:
 
     Attributes
     ----------
-    skin : what it looks at
+    skin : the points of the body and the fold sites
     """
 
     def __init__(self, embedding: Embedding, state: State) -> None:
@@ -362,7 +362,7 @@ class CompiledNetwork:
         self._workspaces = Workspaces()
 
     def outputs(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
-        """Return (B, K) scaled energies of the domains, and (B,) logits, of (B, D) poses."""
+        """Return (B, K) scaled energies of the domains and (B,) logits of (B, D) poses."""
         root, logit = np.empty((len(latent), self._head.n_out - 2)), np.empty(len(latent))
 
         def fill(start: int, stop: int) -> None:
@@ -374,7 +374,7 @@ class CompiledNetwork:
         return np.square(np.maximum(root, 0.0)), logit
 
     def logit_and_gradient(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (B,) logits of (B, D) poses, and each one's (B, D) derivative by its codes."""
+        """Return (B,) logits of (B, D) poses, and their (B, D) derivatives by the codes."""
         logit, gradient = np.empty(len(latent)), np.empty(latent.shape)
 
         def fill(start: int, stop: int) -> None:
@@ -420,12 +420,12 @@ class CompiledNetwork:
 
 
 class _Trace(NamedTuple):
-    """What a forward pass of B poses makes, and the backward pass needs.
+    """The results of a forward pass of B poses that the backward pass needs.
 
     Attributes
     ----------
-    body : where the skin is, what comes near it and how it is deformed
-    patch, fold, head : each layer's values in the small networks
+    body : the posed skin
+    patch, fold, head : each layer's values in the networks
     squashed, softmax : (B, P + S) of the contact logits of patches and folds
     logit : (B,)
     """
@@ -440,12 +440,12 @@ class _Trace(NamedTuple):
 
 
 class _Networks:
-    """n networks of one size side by side, each with separate inputs; silu between layers.
+    """n stacked networks of one size, each with its own inputs; silu between layers.
 
     Parameters
     ----------
     state : the state dict
-    name : of the networks in it, whose inputs are standardised; without one, it is the head
+    name : prefix of the networks, whose inputs are standardised; empty for the head
     """
 
     def __init__(self, state: State, name: str = "") -> None:
@@ -467,7 +467,7 @@ class _Networks:
         self.n_out = self._layers[-1][0].shape[2]
 
     def forward(self, inputs: Array, workspace: Workspace) -> list[Array]:
-        """Apply to (n, B, n_in) inputs; returns each layer's values, before the silu."""
+        """Apply to (n, B, n_in) inputs; return each layer's values, before the silu."""
         values: list[Array] = []
         for number, (weight, bias) in enumerate(self._layers):
             shape = len(weight), inputs.shape[1], weight.shape[2]
@@ -490,8 +490,8 @@ class _Networks:
 
 
 def _copied(values: npt.NDArray[Any]) -> Array:
-    """Copy an array to float32; never read-only, as a model file's arrays are.
+    """Copy an array to writable float32.
 
-    Loops would be compiled for both.
+    A model file's arrays are read-only, and Numba would compile its loops for both kinds.
     """
     return np.array(values, dtype=np.float32, order="C")

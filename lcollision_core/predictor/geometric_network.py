@@ -1,15 +1,15 @@
-"""The default network: features of the reduced body, folds, a field between parts; by torch.
+"""The default network: a reduced body, its folds and a contact field between parts, with torch.
 
-A latent code is a poor coordinate for collision: whether a hand touches a thigh depends on where
-both are, and that on every joint between. So the codes are decoded to some hundred points of the
-skin first (`ReducedBody`), and each has contact features (`ContactField`) of what comes near: how
-much, how far above that skin's surface, in what direction. Skin that folds onto itself, in an
-elbow, shows in the deformation of the few vertices about it (`fold_view`). Small networks, one for
-each point and each site, say whether the patch of skin round it collides, and how deeply, and are
-taught that by its exact energy, which is worth hundreds of labels a pose. What follows joins them
-to the domains' energies and the logit.
+A latent code is a poor coordinate for collision: whether a hand touches a thigh depends on the
+positions of both, and these on every joint between. So the codes are first decoded to a few hundred
+points of the skin (`ReducedBody`), and each has contact features (`ContactField`) of nearby skin:
+how much there is, at what height above its surface, in what direction. Skin that folds onto itself,
+as in an elbow, shows in the deformation of a few vertices around it (`fold_view`). Small networks,
+one for each point and each site, predict whether the surrounding patch of skin collides, and how
+deeply. Their targets are the patches' exact energies, which are worth hundreds of labels per pose.
+A head combines them to the domains' energies and the logit.
 
-What was tried, with its figures, is in docs/experiments.md.
+Experiments and their figures are in docs/experiments.md.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ if TYPE_CHECKING:
 class ContactField(torch.nn.Module):
     """Sums at each point over distant parts of the skin that come near it.
 
-    Implicit moving least squares (Kolluri 2008): another point at distance d weighs
-    (1 - d^2 / radius^2)^3, and less as it falls behind the tangent plane. Whichever points they
-    are, so there is no list of who may meet whom; smooth, and exactly 0 where nothing is near.
+    Implicit moving least squares (Kolluri 2008): another point at distance d has weight
+    (1 - d^2 / radius^2)^3, and less behind the tangent plane. All pairs of points count, so no list
+    of possible contacts is needed; the sums are smooth, and exactly 0 where nothing is near.
 
     Parameters
     ----------
@@ -91,14 +91,14 @@ class ContactField(torch.nn.Module):
 
         Parameters
         ----------
-        frame : (B, N, 3, 3) of each of the first points, as columns, the outer normal first
+        frame : (B, N, 3, 3) local frames of the first N points, as columns, the outer normal first
         positions : (B, 3, P)
 
         Returns
         -------
-        field : (P, B, 2, 8) for each radius: how much is near, from 0 to 1; and weighted means of
-            the point's heights above the others' tangent planes, of the offsets to them (3) and of
-            their normals (3), in the point's frame, heights and offsets in radii
+        field : (P, B, 2, 8) for each radius: the amount of nearby skin, from 0 to 1; and weighted
+            means of the point's heights above the others' tangent planes, of the offsets to them
+            (3) and of their normals (3), in the point's frame, heights and offsets in radii
         """
         frame = frame[:, : positions.shape[2]]
         offset = positions[:, :, None] - positions[..., None]
@@ -120,19 +120,17 @@ class ContactField(torch.nn.Module):
 
 
 FOLD_RADIUS = 0.045
-"""Normalised length along the surface within which colliding faces are a fold of the skin.
-
-Counted from the near exclusion, within which they are no collision.
-"""
+"""Normalised length along the surface, beyond the near exclusion, up to which colliding faces are a
+fold of the skin."""
 
 N_SITES = 128
 N_MEMBERS = 12
 
 _MEMBER_RADIUS = 0.03
-"""Likewise: how far a site's members spread."""
+"""Normalised length, likewise, over which a site's members spread."""
 
 _SPREAD, _REDUNDANCE = 0.02, 0.85
-"""Normalised length within which a chosen site makes its neighbours redundant, and how much."""
+"""Normalised length within which a chosen site makes its neighbours redundant, and by how much."""
 
 _MASKED_FOLD = 0.2
 """Weight of a fold in a pose that collides elsewhere too."""
@@ -147,7 +145,7 @@ class FoldDetector:
     Parameters
     ----------
     embedding : of the body; poses are in normalised length
-    rules, groups : which pairs do not count
+    rules, groups : the contact rules, and the groups that they name
     """
 
     def __init__(
@@ -162,7 +160,7 @@ class FoldDetector:
     def energies(
         self, vertices: npt.NDArray[np.floating], cells: npt.NDArray[np.int32], n_cells: int
     ) -> FloatArray:
-        """Sum the energy of (B, V, 3) poses by cells, (B, n_cells), on the thread that calls.
+        """Sum the energy of (B, V, 3) poses by cells, (B, n_cells), on the calling thread.
 
         Parameters
         ----------
@@ -181,13 +179,13 @@ def find_fold_sites(
 
     Parameters
     ----------
-    embedding : decodes
-    latent : (n, D) poses that collide; some thousands are used
-    rules, groups : which pairs do not count
+    embedding : decodes the poses
+    latent : (n, D) poses that collide; at most `_SEARCHED_POSES` are used
+    rules, groups : the contact rules, and the groups that they name
 
     Returns
     -------
-    members : (S, M) vertices spread about each site, its centre first; S is 0 for a body that does
+    members : (S, M) vertices spread around each site, its centre first; S is 0 for a body that does
         not fold
     """
     score = _fold_frequency(
@@ -208,9 +206,9 @@ def find_fold_sites(
 def _fold_frequency(
     embedding: Embedding, latent: npt.NDArray[np.floating], detector: FoldDetector
 ) -> FloatArray:
-    """Return (V,) in what fraction of the poses each vertex is part of a fold."""
+    """Return (V,) the fraction of poses in which each vertex is part of a fold."""
     n_vertices = len(embedding.rest_vertices)
-    # Of folds each vertex is a cell; all other contact is one.
+    # In folds each vertex is a cell; all other contact is one cell.
     cells = np.stack([np.full(n_vertices, n_vertices), np.arange(n_vertices)]).astype(np.int32)
     folded, weight = np.zeros((len(latent), n_vertices), dtype=np.bool_), np.ones(len(latent))
 
@@ -230,9 +228,9 @@ def _fold_frequency(
 def _spread_members(
     embedding: Embedding, distance: FloatArray, radius: float
 ) -> npt.NDArray[np.int64]:
-    """Choose `N_MEMBERS` vertices about the one at distance 0, each farthest from those before."""
+    """Choose `N_MEMBERS` vertices around the one at distance 0 by farthest-point sampling."""
     order = distance.argsort(kind="stable")
-    # A coarse mesh has too few within the radius: the nearest then; a tiny one repeats its own.
+    # If a coarse mesh has too few within the radius, take the nearest; a tiny one repeats vertices.
     n_near = max(int((distance <= radius).sum()), N_MEMBERS)
     near = np.resize(order[:n_near], n_near)
     members: npt.NDArray[np.int64] = near[
@@ -248,10 +246,10 @@ _SYMMETRIC = [3, 4, 5, 4, 6, 7, 5, 7, 8]
 
 
 class ReducedBody(nn.Module):
-    """Latent codes to the deformation of the skin and the positions of the points of the body.
+    """Decode latent codes to the deformation of the skin and the positions of the body's points.
 
-    The gradients are those of the embedding. Positions are a linear map of those at the points, as
-    the body's vertices are of all gradients, fitted to decoded poses.
+    The gradients are those of the embedding. Positions are a linear map of the gradients at the
+    points, fitted to decoded poses, as the body's vertices are a linear map of all gradients.
 
     Parameters
     ----------
@@ -275,7 +273,7 @@ class ReducedBody(nn.Module):
             fixed[name] = getattr(skin, name)
         for name, values in fixed.items():
             self.register_buffer(name, torch.tensor(values), persistent=False)
-        # Of the model file: fitted, not a function of the embedding.
+        # Stored in the model file: fitted, not a function of the embedding.
         self.register_buffer("points", torch.zeros(3 * self.n_points, self.n_points))
         self.register_buffer("origin", torch.zeros(3, self.n_points))
 
@@ -284,7 +282,7 @@ class ReducedBody(nn.Module):
 
         Parameters
         ----------
-        latent : (n, D) array, n of some thousands
+        latent : (n, D) array, n a few thousand
         positions : (n, P, 3) array, the points of the decoded poses, in normalised length
         """
         width = 3 * self.n_points + 3
@@ -304,7 +302,7 @@ class ReducedBody(nn.Module):
         self.origin.copy_(solution[-3:])
 
     def features(self, latent: torch.Tensor) -> torch.Tensor:
-        """Return the (B, Q, 9) deformation features of the skin, of (B, D) codes."""
+        """Return the skin's (B, Q, 9) deformation features of (B, D) codes."""
         products = [
             latent[:, codes] @ self.get_buffer(f"table{number}")
             for number, codes in enumerate(self._codes)
@@ -320,7 +318,7 @@ class ReducedBody(nn.Module):
 
         Returns
         -------
-        frame : (B, N, 3, 3) of the first points, R F with their frames F on the reference
+        frame : (B, N, 3, 3) local frames of the first N points: R F, with F those on the reference
         gradients : (B, 3, Q, 3) rows of the deformation gradients R S
         positions : (B, 3, P) of the points of the body, in normalised length
         """
@@ -333,7 +331,7 @@ class ReducedBody(nn.Module):
         return frame, gradients, positions
 
     def fold_view(self, frame: torch.Tensor, gradients: torch.Tensor) -> torch.Tensor:
-        """Return how the skin is deformed about the fold sites, however the body is turned.
+        """Return the skin's deformation around the fold sites, invariant to rotation of the body.
 
         Returns
         -------
@@ -370,11 +368,12 @@ PATCH_WIDTH = 32
 HEAD_SIZES = (256, 64)
 
 _ROWS_AT_ONCE, _ROWS_OF_A_THREAD = 128, 32
-"""Poses of which all arrays are in memory together, and whose skin a thread poses at once."""
+"""Poses whose arrays are in memory together, and poses whose skin one thread computes at once."""
 
 _PATCH_WEIGHT, _DEPTH_WEIGHT = 20.0, 5.0
 _FOLD_WEIGHT, _FOLD_DEPTH_WEIGHT = 5.0, 1.25
-"""Weights of cross entropies and depths, means over hundreds of mostly free patches."""
+"""Weights of the patches' and folds' cross entropies and depths, means over hundreds of mostly free
+patches."""
 
 _FITTED_POSES = 4000
 _MEASURED_POSES = 2000
@@ -382,11 +381,11 @@ _LEAST_DEVIATION, _LEAST_GRADIENT_DEVIATION = 2e-2, 1e-3
 
 
 class _Auxiliary(NamedTuple):
-    """What the loss needs beside energies and logit.
+    """Outputs that the loss needs besides energies and logit.
 
     Attributes
     ----------
-    patch_logit : (B, P + S) of each patch and each fold colliding
+    patch_logit : (B, P + S) logits of a collision of each patch and each fold
     patch_root : (B, P + S) square roots of their energies
     root_energy : (B, K + 1) square roots of the domains' energies and of their sum
     """
@@ -397,13 +396,13 @@ class _Auxiliary(NamedTuple):
 
 
 class GeometricNetwork(PredictorNetwork):
-    """Patches of skin, each with a network that reads its contact features.
+    """A network for each patch of skin, which reads its contact features, and a common head.
 
     Parameters
     ----------
     embedding : of the body
     seed : of the initial weights
-    sites : (S, M) integer array, vertices about each site where the skin folds, see
+    sites : (S, M) integer array, vertices around each site where the skin folds, see
         `find_fold_sites`
     n_points, width : P, and the size of the patches' hidden layers
 
@@ -413,7 +412,7 @@ class GeometricNetwork(PredictorNetwork):
 
     Attributes
     ----------
-    skin : what it looks at
+    skin : the points of the body and the fold sites
     """
 
     site_vertices: torch.Tensor
@@ -432,7 +431,7 @@ class GeometricNetwork(PredictorNetwork):
         self.body = ReducedBody(skin)
         self.field = ContactField(skin)
         self._workspaces = Workspaces()
-        # Of the model file: found in labelled poses.
+        # Stored in the model file: found in labelled poses.
         self.register_buffer("site_vertices", torch.tensor(sites, dtype=torch.int32))
         self.patch = _PatchNetworks(skin.n_points, UNITS.size, width, generator)
         self.fold = _PatchNetworks(len(sites), 9 * N_MEMBERS, width, generator)
@@ -453,11 +452,11 @@ class GeometricNetwork(PredictorNetwork):
         rules: ContactRules = STRICT,
         groups: Sequence[FaceGroup] = (),
     ) -> PredictorNetwork:
-        """Make the network of an embedding, its points, sites and inputs fitted to the rows.
+        """Make the network of an embedding, with its points, sites and inputs fitted to the rows.
 
         Raises
         ------
-        LCollisionError : a network without domains is asked for.
+        LCollisionError : a network without domains is requested.
         """
         if not config.by_domain:
             raise LCollisionError(
@@ -477,7 +476,7 @@ class GeometricNetwork(PredictorNetwork):
         config: PredictorConfig,  # noqa: ARG003
         state: dict[str, torch.Tensor],
     ) -> PredictorNetwork:
-        """Make a trained network from its state dict, whose sizes may be an older program's.
+        """Make a trained network from its state dict, whose sizes may be of an older version.
 
         Raises
         ------
@@ -514,7 +513,7 @@ class GeometricNetwork(PredictorNetwork):
         )
 
     def _inputs(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (P, B, n) contact features, and (S, B, n) how each site is deformed."""
+        """Return (P, B, n) contact features, and (S, B, n) deformations of the sites."""
         is_plain = latent.dtype == torch.float32 and not latent.requires_grad
         if latent.device.type == "cpu" and is_plain:
             return self._compiled_inputs(latent.numpy())
@@ -524,7 +523,7 @@ class GeometricNetwork(PredictorNetwork):
     def _compiled_inputs(
         self, latent: npt.NDArray[np.float32]
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the inputs by the compiled loops, in a few times less time than torch takes."""
+        """Return the inputs by the compiled loops, which are several times faster than torch."""
         skin = CompiledSkin(self.skin, self.body.points.numpy(), self.body.origin.numpy())
         field = np.empty((self.skin.n_points, len(latent), UNITS.size), dtype=np.float32)
         folds = np.empty((len(self.site_vertices), len(latent), 9 * N_MEMBERS), dtype=np.float32)
@@ -560,7 +559,7 @@ class GeometricNetwork(PredictorNetwork):
         values = self.head[-1](values)
         contact = torch.logsumexp(patch_logit, dim=1) * self.any_hit[0] + self.any_hit[1]
         root = values[:, 1:]
-        # Energies are learned as square roots: their tail is long.
+        # Energies are learned as square roots, as they have a long tail.
         energy = root[:, :-1].clamp_min(0.0).square()
         return NetworkOutput(
             energy, values[:, 0] + contact, _Auxiliary(patch_logit, patch_root, root)
@@ -574,10 +573,10 @@ class GeometricNetwork(PredictorNetwork):
         config: PredictorConfig,
         margin: float,  # noqa: ARG002
     ) -> torch.Tensor:
-        """Sum up this process's share of the batch's mean loss: patches included, no ranking."""
+        """Return this process's share of the batch's mean loss, with patches, without ranking."""
         own = batch.part(*part)
         if not len(own.energy):
-            # The mean of no row is not a number; their sum is 0, and depends on the parameters.
+            # The mean of no rows is NaN; their sum is 0, and depends on the parameters.
             return output.logit.sum()
         fraction = len(own.energy) / len(batch.energy)
         patch_logit, patch_root, root = output.auxiliary
@@ -602,7 +601,7 @@ class GeometricNetwork(PredictorNetwork):
 
 
 class _PatchNetworks(nn.Module):
-    """A small network for each of n patches: (n, B, n_in) to (n, B, 2), logit and root energy."""
+    """A small network for each of n patches, (n, B, n_in) to (n, B, 2): logit and root energy."""
 
     mean: torch.Tensor
     deviation: torch.Tensor
@@ -620,14 +619,14 @@ class _PatchNetworks(nn.Module):
             cast(StackedLinear, self.layers[-1]).bias[:, :, 0] = -3.0
 
     def fit(self, inputs: torch.Tensor, least_deviation: float) -> None:
-        """Store the means and deviations of some inputs."""
+        """Store the means and deviations of inputs."""
         if not inputs.numel():
             return
         self.mean.copy_(inputs.mean(dim=1, keepdim=True))
         self.deviation.copy_(inputs.std(dim=1, keepdim=True) + least_deviation)
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
-        # In one pass over the inputs.
+        # Standardise in one pass over the inputs.
         scale = self.deviation.reciprocal()
         values = torch.addcmul(-self.mean * scale, inputs, scale)
         for layer in self.layers[:-1]:

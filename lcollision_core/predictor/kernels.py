@@ -1,12 +1,12 @@
 """The compiled loops of the predictor's network: field, skin and layers.
 
-Several points are taken at a time, without branches: far ones weigh 0. Those are mostly left out
-all the same: forward, a block of neighbours goes through the points near its box, side by side;
-backward, where the others are added to as well, each point goes through the blocks that are near
-its own. Sums over points run in a fixed order.
+Several points are processed at a time, without branches: far ones have weight 0. Most of these are
+skipped: in the forward pass, a block of neighbours loops over the points near its box, in parallel
+lanes; in the backward pass, which adds to the other points too, each point loops over the blocks
+near its own. Sums over points run in a fixed order.
 
-Array operations spend most of their time on passing temporary arrays through memory; these keep
-a point's few numbers at hand.
+Array operations spend most of their time on passing temporary arrays through memory; these loops
+keep a point's few numbers in registers.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ Array = npt.NDArray[np.floating[Any]]
 Number = np.floating[Any]
 
 BEHIND, FADE = 0.07, 0.04
-"""Normalised lengths behind a point's tangent plane beyond which others weigh nothing, so that the
-far side of a limb does not count, and over which their weight rises."""
+"""Normalised distance behind a point's tangent plane beyond which others have weight 0, so that the
+far side of a limb does not count, and the distance over which their weight rises."""
 
 RADII = (0.07, 0.14)
-"""Normalised lengths within which distant skin counts."""
+"""Normalised distances within which distant skin counts."""
 
 UNITS = np.array([[1.0, *[1.0 / radius] * 4, 1.0, 1.0, 1.0] for radius in RADII])
-"""(2, 8) factors of the sums of each radius: heights and offsets are in radii."""
+"""(2, 8) factors of the sums for each radius: heights and offsets are in radii."""
 
 STEEPNESS = (RADII[0] ** -2, RADII[1] ** -2)
-"""Here, as loops that reorder sums would divide by what is inverted in them."""
+"""Computed here: loops that may reorder operations would divide instead."""
 
 FULL, SOME = 0.3, 0.05
-"""Sums of weights: one that fills half of the scale, and one that keeps means of nothing at 0."""
+"""Sums of weights: the one at half of the scale, and one that keeps empty means at 0."""
 
 BLOCK = 8
-"""Neighbours that are taken, or left out, together."""
+"""Number of neighbouring points that are processed, or skipped, together."""
 
 
 def in_blocks(
     geodesic_neighbours: npt.NDArray[np.float32], order: npt.NDArray[np.int32]
 ) -> npt.NDArray[np.float32]:
-    """Lay out which pairs are neighbours along the surface as the loops read it.
+    """Arrange the table of neighbours along the surface in the order in which the loops read it.
 
     Parameters
     ----------
@@ -56,8 +56,8 @@ def in_blocks(
 
     Returns
     -------
-    blocks : (O / BLOCK, O, BLOCK) of each block, all points in order, and the block's; 1 also for
-        points that are in the order again
+    blocks : (O / BLOCK, O, BLOCK), for each block all points in order by the block's points; 1 also
+        for points that are repeated in the order
     """
     rows = geodesic_neighbours[np.ix_(order, order)]
     rows[len(geodesic_neighbours) :] = rows[:, len(geodesic_neighbours) :] = 1.0
@@ -72,17 +72,17 @@ def contact_field(
     neighbours: Array,
     field: Array,
 ) -> None:
-    """Fill in the field (P, B, 2, 8) of `geometric.field.ContactField`, block by block.
+    """Fill in the field (P, B, 2, 8) of `geometric_network.ContactField`, block by block.
 
     Parameters
     ----------
-    frame, positions : (B, N, 3, 3), orthonormal, and (B, 3, P), as there
+    frame, positions : (B, N, 3, 3), orthonormal, and (B, 3, P), as for `ContactField`
     order : (O,) of `SkinGeometry`
-    neighbours : as `in_blocks` returns it
+    neighbours : from `in_blocks`
     """
     n_points, n_ordered = positions.shape[2], len(order)
     n_blocks = n_ordered // BLOCK
-    # A width that compilers know to be `BLOCK` would be unrolled point by point.
+    # If the compiler knew that the width is `BLOCK`, it would unroll loops point by point.
     width = n_ordered // n_blocks
     dtype = frame.dtype.type
     ordered = np.empty((6, n_ordered), dtype=frame.dtype)
@@ -125,7 +125,7 @@ def _find_near(
     gap: Array,
     near: npt.NDArray[np.uintp],
 ) -> int:
-    """List the points within the outer radius of a block's box; returns how many there are."""
+    """List the points within the outer radius of a block's box; return their number."""
     zero, one = ordered.dtype.type(0.0), ordered.dtype.type(1.0)
     low_x, low_y, low_z = boxes[0, own], boxes[1, own], boxes[2, own]
     high_x, high_y, high_z = boxes[3, own], boxes[4, own], boxes[5, own]
@@ -154,16 +154,16 @@ def _add_near(
     width: int,
     lanes: Array,
 ) -> None:
-    """Add the weighted sums over some other points to a block's points.
+    """Add the weighted sums over other points to a block's points.
 
     Parameters
     ----------
-    near : the others, of those in order
+    near : the other points, as indices into the order
     neighbours : (O, BLOCK) of the block
     width : `BLOCK`
-    lanes : (22 BLOCK,) of each of its points position and normal, then its sums with the inner
-        radius, then with the outer one: of weights, heights, offsets and normals; in one array,
-        or else compilers would not see that nothing overlaps
+    lanes : (22 BLOCK,) for each of the block's points its position and normal, then its sums with
+        the inner and with the outer radius: of weights, heights, offsets and normals; one array,
+        as the compiler could not tell that several do not overlap
     """
     dtype = ordered.dtype.type
     zero, one, two = dtype(0.0), dtype(1.0), dtype(2.0)
@@ -220,7 +220,7 @@ def contact_field_backward(
     grad_frame: Array,
     grad_positions: Array,
 ) -> None:
-    """Pull derivatives by `contact_field`'s results back, adding to frames and positions."""
+    """Pull derivatives by `contact_field`'s results back; add them to frames and positions."""
     n_points, n_ordered = positions.shape[2], len(order)
     dtype = frame.dtype.type
     zero, one, two, three, six = dtype(0.0), dtype(1.0), dtype(2.0), dtype(3.0), dtype(6.0)
@@ -255,7 +255,7 @@ def contact_field_backward(
                 (inner[0], inner[1], inner[2], inner[3], inner[4], inner[5], inner[6], inner[7]),
                 (outer[0], outer[1], outer[2], outer[3], outer[4], outer[5], outer[6], outer[7]),
             )
-            # By the point's position and normal.
+            # Derivatives by the point's position and normal.
             at_x, at_y, at_z, own_a, own_b, own_c = zero, zero, zero, zero, zero, zero
             for q in range(n_gathered):
                 dx, dy, dz = x[q] - px, y[q] - py, z[q] - pz
@@ -285,7 +285,7 @@ def contact_field_backward(
                     grad_qx += weight * of_nx
                     grad_qy += weight * of_ny
                     grad_qz += weight * of_nz
-                # Of t cubed; and the slope of the smooth step.
+                # The derivative of t cubed, and that of the smooth step.
                 radial = -six * facing * grad_squared
                 grad_ahead = grad_facing * six * s * (one - s) * sharpness
                 grad_dx += radial * dx - grad_above * qx + grad_ahead * own_x
@@ -326,7 +326,7 @@ def contact_field_backward(
 def _order(
     frame: Array, positions: Array, order: npt.NDArray[np.int32], ordered: Array, boxes: Array
 ) -> None:
-    """Fill in positions and normals in their order, and the box round each block: low and high."""
+    """Fill in positions and normals in order, and the low and high corner of each block's box."""
     for i in range(len(order)):
         q = order[i]
         for c in range(3):
@@ -349,9 +349,9 @@ def _gather(
     near: npt.NDArray[np.uintp],
     gathered: Array,
 ) -> int:
-    """List where the blocks start that may be near a block's points, and copy them side by side.
+    """List the starts of blocks that may be near a block's points, and copy them side by side.
 
-    Returns how many points they have.
+    Return the number of their points.
     """
     zero, one = ordered.dtype.type(0.0), ordered.dtype.type(1.0)
     n_near = 0
@@ -371,15 +371,15 @@ def _gather(
 def _copy_blocks(
     given: Array, start: int, times: int, near: npt.NDArray[np.uintp], n_gathered: int, copy: Array
 ) -> None:
-    """Copy blocks side by side, each in one piece, as a loop over its points would not.
+    """Copy blocks side by side, each at once, which a loop over its points would not do.
 
-    They begin at so many times their numbers after a start.
+    Block n begins at `start` plus `times` times `near[n]`.
     """
     i1, i2, i3, i4 = np.uintp(1), np.uintp(2), np.uintp(3), np.uintp(4)
     i5, i6, i7 = np.uintp(5), np.uintp(6), np.uintp(7)
     for n in range(n_gathered // BLOCK):
         i, j = np.uintp(start) + np.uintp(times) * near[n], np.uintp(BLOCK * n)
-        # All are read before any is written.
+        # Read all values before writing any.
         v0, v1, v2, v3 = given[i], given[i + i1], given[i + i2], given[i + i3]
         v4, v5, v6, v7 = given[i + i4], given[i + i5], given[i + i6], given[i + i7]
         copy[j], copy[j + i1], copy[j + i2], copy[j + i3] = v0, v1, v2, v3
@@ -390,7 +390,7 @@ def _copy_blocks(
 def _sums_backward(
     frame: Array, field: Array, grad_field: Array, grad_sums: Array, grad_frame: Array
 ) -> None:
-    """Fill in derivatives by a point's sums (2, 8) in the world; adds those by its frame."""
+    """Fill in derivatives by a point's sums (2, 8) in world axes; add those by its frame."""
     dtype = frame.dtype.type
     for k in range(2):
         weight = dtype(FULL) * field[k, 0] / (dtype(1.0) - field[k, 0])
@@ -401,7 +401,7 @@ def _sums_backward(
         grad_sums[k, 1] = grad_field[k, 1] * dtype(UNITS[k, 1]) / total
         for start in (2, 5):
             for i in range(3):
-                # The frame is orthonormal: it turns its sums back into the world.
+                # The frame is orthonormal: it turns the sums back to world axes.
                 world = turned = dtype(0.0)
                 for c in range(start, start + 3):
                     world += frame[i, c - start] * field[k, c]
@@ -415,20 +415,20 @@ SingleArray = npt.NDArray[np.float32]
 
 _LOG2_E = np.float32(1.0 / math.log(2.0))
 _POWER = tuple(np.float32(math.log(2.0) ** n / math.factorial(n)) for n in range(6, -1, -1))
-"""Taylor's coefficients of 2^r, the highest first: enough for single precision up to 1/2."""
+"""Taylor coefficients of 2^r, highest order first: accurate to single precision for |r| <= 1/2."""
 
 _SMALL = 2**15
-"""Size of an array up to which new memory is cheap."""
+"""Size of an array up to which allocating it is cheap."""
 
 
 class Workspace:
-    """Large arrays that the next pass fills again: new memory costs as much as filling it."""
+    """Large arrays that the next pass reuses: allocating memory costs as much as filling it."""
 
     def __init__(self) -> None:
         self._memory: dict[str, SingleArray] = {}
 
     def empty(self, name: str, *shape: int) -> SingleArray:
-        """Return an array whose values are no longer needed."""
+        """Return an uninitialised array, which may reuse memory."""
         size = math.prod(shape)
         if size < _SMALL:
             return np.empty(shape, dtype=np.float32)
@@ -438,7 +438,7 @@ class Workspace:
 
 
 class Workspaces:
-    """Workspaces kept from pass to pass: of one pose and the solver's few, or of two threads."""
+    """Keeps up to two workspaces between passes, for two sizes of batches or two threads."""
 
     def __init__(self) -> None:
         self._spare: deque[Workspace] = deque(maxlen=2)
@@ -478,14 +478,14 @@ def silu_backward(values: SingleArray, grad: SingleArray) -> None:
 
 @compiled_sums
 def _exponential(x: np.float32) -> np.float32:
-    """Return exp(x), between those of +-87.3: several at a time, as the library's is not."""
+    """Return exp(x), with x clipped to +-87.3; unlike the library's, it is vectorised."""
     y = min(max(x * _LOG2_E, np.float32(-126.0)), np.float32(126.0))
     whole = np.floor(y + np.float32(0.5))
     rest = y - whole
     power = np.float32(0.0)
     for term in _POWER:
         power = power * rest + term
-    # A power of two by its bits.
+    # Build a power of two from its bits.
     return power * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
 
 
@@ -496,9 +496,9 @@ SMALLEST_SQUARED_ANGLE = 1e-12
 def add_features(
     outputs: Array, target: npt.NDArray[np.int32], offset: Array, scale: Array, features: Array
 ) -> None:
-    """Sum up each point's scaled outputs (B, T, 9) over the groups that move it: (B, Q, 9)."""
+    """Add up each point's scaled outputs (B, T, 9) over the groups that move it: (B, Q, 9)."""
     for b in range(outputs.shape[0]):
-        # Number by number: assigning arrays takes seconds to compile.
+        # Element by element: assigning arrays takes seconds to compile.
         for q in range(features.shape[1]):
             for c in range(9):
                 features[b, q, c] = offset[q, c]
@@ -515,7 +515,7 @@ def add_features_backward(
     grad_features: Array,
     grad_products: Array,
 ) -> None:
-    """Pull derivatives by `add_features`' features back to what the tanh was taken of."""
+    """Pull derivatives by the features of `add_features` back to the arguments of tanh."""
     one = outputs.dtype.type(1.0)
     for b in range(outputs.shape[0]):
         for n in range(outputs.shape[1]):
@@ -595,7 +595,7 @@ def deform_backward(
             grad[4] = grad_stretch[0, 1] + grad_stretch[1, 0]
             grad[5] = grad_stretch[0, 2] + grad_stretch[2, 0]
             grad[7] = grad_stretch[1, 2] + grad_stretch[2, 1]
-            # By w: of R = c I + s [w] + v w w^T, and of s, v and c, which follow from |w|.
+            # Derivative by w of R = c I + s [w] + v w w^T, where s, v and c depend on |w|.
             x, y, z = features[b, q, 0], features[b, q, 1], features[b, q, 2]
             s, v, c, squared = turns[0, b, q], turns[1, b, q], turns[2, b, q], turns[3, b, q]
             g = grad_turn
@@ -615,7 +615,7 @@ def deform_backward(
 
 @compiled_part
 def _rotation(features: Array, turn: Array) -> tuple[tuple[Number, ...], ...]:
-    """Return the rows of the rotation about w, see `rodrigues`."""
+    """Return the rows of the rotation exp [w], see `rodrigues`."""
     x, y, z = features[0], features[1], features[2]
     s, v, c = turn[0], turn[1], turn[2]
     xy, yz, zx = v * x * y, v * y * z, v * z * x
@@ -659,7 +659,7 @@ def fold_view_backward(
     grad_frame: Array,
     grad_rows: Array,
 ) -> None:
-    """Pull derivatives by `fold_view`'s inputs back, adding to frames and gradients."""
+    """Pull derivatives by `fold_view`'s inputs back; add them to frames and gradients."""
     for b in range(frame.shape[0]):
         for s in range(members.shape[0]):
             q = members[s, 0]

@@ -1,4 +1,4 @@
-"""The optimisation of a predictor by torch: losses, patches of labels, worker processes."""
+"""Optimise a predictor with torch: losses, labels of patches, several processes."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ from lcollision_core.predictor.presets import NETWORKS
 
 @dataclass(frozen=True)
 class Processes:
-    """One process among those that train together.
+    """One of the processes that train together.
 
     Attributes
     ----------
-    rank : its number from 0; the first writes for all
-    count : of the processes, 1 for one alone
-    device : it trains on
+    rank : its index, from 0; process 0 writes for all
+    count : number of processes
+    device : that it trains on
     """
 
     rank: int
@@ -55,13 +55,13 @@ class Processes:
     device: torch.device
 
     def share(self, n_rows: int) -> tuple[int, int]:
-        """Return which rows of a batch, first and last + 1, are this process's: an even first."""
+        """Return the start, which is even, and stop of this process's rows of a batch."""
         each = -(-n_rows // (2 * self.count)) * 2
         start = min(self.rank * each, n_rows)
         return start, min(start + each, n_rows)
 
     def any_of(self, flag: bool) -> bool:
-        """Return whether any process passes True, to all of them."""
+        """Return, in all processes, whether any of them passes True."""
         return bool(self._reduced(torch.tensor(float(flag)), dist.ReduceOp.MAX))
 
     def sum_of(self, value: torch.Tensor) -> float:
@@ -75,11 +75,11 @@ class Processes:
             values[...] = total.cpu().numpy()
 
     def require_same(self, number: int) -> None:
-        """Refuse to continue if the processes begin at different steps.
+        """Check that all processes begin at the same step.
 
         Raises
         ------
-        LCollisionError : they do.
+        LCollisionError : they do not.
         """
         least, largest = self._reduced(torch.tensor([-number, number]), dist.ReduceOp.MAX).tolist()
         if -least != largest:
@@ -103,11 +103,11 @@ class Processes:
 
 @contextmanager
 def joined_processes(device: str) -> Iterator[Processes]:
-    """Join the other processes that torchrun started, if it did.
+    """Join the other processes if torchrun started this one.
 
     Parameters
     ----------
-    device : "cpu", "cuda", or "auto" for CUDA where there is one
+    device : "cpu", "cuda", or "auto" for CUDA if there is such a device
 
     Raises
     ------
@@ -144,19 +144,19 @@ _PATCH_FRACTION, _FOLD_FRACTION = 0.05, 0.005
 """Typical fractions of a pose's energy in a colliding patch, and in a colliding fold."""
 
 _LEAST_ROOT = 1e-3
-"""Keeps the shallowest contact distinct from none in half precision."""
+"""Least root, which keeps the shallowest contact distinct from none in half precision."""
 
 
 class PatchLabeller:
-    """Finds the exact energy of each patch of skin, and of each fold.
+    """Find the exact energy of each patch of skin, and of each fold.
 
     Parameters
     ----------
-    embedding : decodes
+    embedding : decodes the poses
     rows : labelled poses
-    cells : pairs within `FOLD_RADIUS` of each other along the surface go to the folds, if any
+    cells : pairs within `FOLD_RADIUS` of each other along the surface belong to folds, if any
     energy_scale : the mean energy of a colliding pose, in normalised length squared
-    rules, groups : by which the rows were labelled: which pairs of faces do not count
+    rules, groups : the contact rules of the labels, and the groups that they name
     """
 
     def __init__(
@@ -181,19 +181,19 @@ class PatchLabeller:
         index: npt.NDArray[np.int64],
         job: Job = UNWATCHED,
     ) -> npt.NDArray[np.float16]:
-        """Label some of the rows, on all cores.
+        """Label the patches of rows, on all cores.
 
-        Poses that are labelled free have no energy, and are not looked at again.
+        Poses labelled as free have no energy and are skipped.
 
         Parameters
         ----------
-        index : (n,) the rows
-        job : reports rows that collide; polled for every block of rows
+        index : (n,) indices of the rows
+        job : reports colliding rows; polled for every block of rows
 
         Returns
         -------
-        roots : (n, P + S) float16 array: square roots of the sums of PDe, in units that make them
-            about 1 where a patch or a fold collides; 0 where it does not
+        roots : (n, P + S) float16 array: square roots of the sums of PDe, in units in which they
+            are about 1 for a colliding patch or fold; 0 without collision
 
         Raises
         ------
@@ -215,27 +215,27 @@ class PatchLabeller:
 
 
 _RUN_VERSION = 8
-"""Raised when training changes, so that no checkpoint is resumed with other rules."""
+"""Raised when training changes, so that no checkpoint of other code is resumed."""
 
 _WATCHED_ROWS = 4000
-"""Held-out rows whose error rates are shown while training."""
+"""Number of held-out rows whose error rates are shown during training."""
 
 _BUILDING_ROWS = 65_536
-"""Training rows that a network may see when it is built: enough for its statistics."""
+"""Number of training rows for building a network: enough for its statistics."""
 
 _SECONDS_BETWEEN_REPORTS = 0.25
 _STEPS_BETWEEN_TALKS = 20
-"""Processes agree at this interval on whether to stop or to save: each time costs a round trip."""
+"""Interval at which processes agree on whether to stop, which costs a round trip."""
 
 _TIMES_PATCHES_KEPT, _LEAST_PATCHES_KEPT = 20, 4096
-"""Patches are written after each twentieth of the training rows, or after so many rows."""
+"""Patches are written after each twentieth of the training rows, but at least so many rows."""
 
 _STEPS_BETWEEN_CLEARINGS = 100
 _TINY_MOMENT = 1e-30
-"""What falls by 0.9 a step, as Adam's mean does, is still in normal form so many steps later."""
+"""Adam's mean, which falls by 0.9 a step, is still a normal number so many steps after this."""
 
 _STEPS_BETWEEN_AVERAGES = 10
-"""The mean of the weights uses every n-th step: all of them would cost a sixth of the time."""
+"""Steps between updates of the mean weights: one every step would take a sixth of the time."""
 
 _WARM_UP = 0.2
 _LEAST_RATE = 1e-2
@@ -247,12 +247,12 @@ _NETWORK, _AVERAGE, _OPTIMISER = "network:", "average:", "optimiser:"
 
 @dataclass(eq=False)
 class TrainingLoop:
-    """Trains a preset's network.
+    """Train a preset's network.
 
     Parameters
     ----------
-    rows : samples 0, 1, 2, ...; the latent codes are read in place and never copied whole
-    split : which of them train
+    rows : samples 0, 1, 2, ...; the latent codes are read in place and never copied as a whole
+    split : the roles of the rows
     embedding, config, facts : see `training.train_predictor`
     device : "auto", "cpu" or "cuda"
     checkpoint : a file, or None
@@ -270,7 +270,7 @@ class TrainingLoop:
     groups: Sequence[FaceGroup] = ()
 
     def __post_init__(self) -> None:
-        # A file of its own, for it is large, and written before the first step.
+        # The patches have their own file: it is large, and written before the first step.
         self._patches_path = self.checkpoint and patches_path(self.checkpoint)
         self._rules = STRICT if self.facts.store is None else self.facts.store.rules
         self._training_index = self.split.training
@@ -286,11 +286,11 @@ class TrainingLoop:
         self._preparing: float | None = None
 
     def run(self) -> PredictorNetwork:
-        """Train, or go on from the checkpoint; returns the network on the training device.
+        """Train, or resume from the checkpoint; return the network on the training device.
 
         Raises
         ------
-        LCollisionError : the checkpoint is another run's, there is no such device, or the
+        LCollisionError : the checkpoint belongs to another run, there is no such device, or the
             training diverges.
         CancelledError : the job was cancelled; the checkpoint holds the last step.
         """
@@ -338,8 +338,8 @@ class TrainingLoop:
             optimiser.zero_grad(set_to_none=True)
             output = shared(latent[part[0] : part[1]])
             loss = network.loss(output, targets, part, config, self.facts.margin)
-            # Processes average their gradients, but each holds a share of the sum; and they wait
-            # for every parameter's, those among them that this loss leaves out.
+            # Processes average their gradients, but each has a share of the sum; and they wait for
+            # the gradient of every parameter, even of those that this loss leaves out.
             outputs = (output.domain_energy, output.logit, *output.auxiliary)
             idle = sum((0.0 * values.sum() for values in outputs), start=0.0 * loss)
             torch.autograd.backward(loss * processes.count + idle)
@@ -360,7 +360,7 @@ class TrainingLoop:
     def _patch_roots(
         self, network: PredictorNetwork, key: str, processes: Processes
     ) -> npt.NDArray[np.float16]:
-        """Label the patches, or go on from what an earlier run kept beside the checkpoint."""
+        """Label the patches, or resume from the file of an earlier run beside the checkpoint."""
         n_rows = len(self._training_index)
         cells = network.skin_cells(self.embedding)
         if cells is None:
@@ -391,7 +391,7 @@ class TrainingLoop:
         part: npt.NDArray[np.float16],
         processes: Processes,
     ) -> None:
-        """Fill in the zeros of a part of the training rows, each process its share."""
+        """Fill in the roots of a part of the training rows; each process labels its share."""
 
         def report(done: int, total: int) -> None:
             self._preparing = (start + len(part) * done / total) / len(self._training_index)
@@ -450,7 +450,7 @@ class TrainingLoop:
         )
 
     def _judged(self, network: PredictorNetwork) -> PredictorNetwork:
-        """Return the network to measure and store: itself, or with the mean of its weights."""
+        """Return the network to measure and store, with the mean weights if they are kept."""
         return network if self._average is None else cast(PredictorNetwork, self._average.module)
 
     def _key(self) -> str:
@@ -491,7 +491,7 @@ class TrainingLoop:
     def _restore(
         self, checkpoint: Checkpoint, network: PredictorNetwork, optimiser: torch.optim.Optimizer
     ) -> int:
-        """Load a stored run's state and return the steps that it has done."""
+        """Load a stored run's state and return the number of steps done."""
         stored = checkpoint.get(_PART)
         if stored is None:
             return 0
@@ -514,7 +514,7 @@ class TrainingLoop:
 
 @dataclass(eq=False)
 class _Batches:
-    """Cuts each epoch's order into batches; the order depends on seed and epoch alone."""
+    """Divide each epoch's order into batches; the order depends only on seed and epoch."""
 
     rows: LabelRows
     training_index: npt.NDArray[np.int64]
@@ -548,7 +548,7 @@ class _Batches:
 
 
 def _error_rates(network: PredictorNetwork, rows: LabelRows) -> tuple[float | None, float | None]:
-    """Return the false positive and the false negative rate: see `error_rates`."""
+    """Return the false positive and false negative rates: see `error_rates`."""
     device = next(network.parameters()).device
     parts = torch.split(torch.from_numpy(rows.latent), BATCH_ROWS)
     network.eval()
@@ -561,7 +561,7 @@ def _error_rates(network: PredictorNetwork, rows: LabelRows) -> tuple[float | No
 def _averaged(network: PredictorNetwork, weight: float) -> AveragedModel:
     """Return a copy for the exponential moving average of the weights; `weight` is the newest's.
 
-    The first few count alike.
+    The first few have equal weights.
     """
 
     def mean(average: Tensor, newest: Tensor, n_averaged: Tensor | int) -> Tensor:
@@ -571,10 +571,10 @@ def _averaged(network: PredictorNetwork, weight: float) -> AveragedModel:
 
 
 def _clear_tiny_moments(optimiser: torch.optim.Optimizer) -> None:
-    """Set Adam's running means to 0 before they leave the normal form of numbers.
+    """Set Adam's running means to 0 before they become denormal numbers.
 
-    Those of weights that have no slope any more, two thirds of the paper's network, would come to
-    that, and processors take 16 times as long for such numbers.
+    Weights whose gradient has vanished, two thirds of the paper's network, would have such means,
+    with which CPUs are 16 times slower.
     """
     for moments in optimiser.state.values():
         for name in ("exp_avg", "exp_avg_sq"):
