@@ -1,4 +1,4 @@
-"""Files, read and written: meshes, scenes, characters, motions and pose sets."""
+"""Read and write files: meshes, scenes, characters, motions and pose sets."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -7,7 +7,7 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str) -> Any:
-        """Load the readers, and SciPy with them, not before they are asked for."""
+        """Load the readers, and SciPy with them, only when they are needed."""
         from importlib import import_module
 
         if name.startswith("_"):

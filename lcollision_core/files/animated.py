@@ -35,13 +35,13 @@ class AnimatedMesh:
     Attributes
     ----------
     vertices : (N, V, 3) float64 array; pose 0 is the rest pose
-    topology : of all poses
+    topology : topology of all poses
     names : "rest", then "wave 0", "wave 1" ...
-    notes : sentences on what was changed on reading
-    up_axis : 0, 1 or 2 where the file says it, else None
+    notes : sentences on changes made on reading
+    up_axis : 0, 1 or 2, None if the file does not define it
     vertex_labels : (V,) strings, the body part of each vertex by the joints; None without joints
     groups : named meshes and materials of a scene
-    metres : length of the file's unit, None where that does not say it
+    metres : length of the file's unit, None if the file does not define it
     """
 
     vertices: FloatArray
@@ -67,16 +67,16 @@ def read_animated(
     ----------
     path : a file with an extension of `ANIMATED_SUFFIXES`; the mesh of a point cache has the same
         name with the extension of a mesh
-    clip : which animation of a scene; None for all
-    fps : frames a second; None for the clip's keys, at most 30 a second. A point cache has the
-        frames that it has.
-    job : reports (frames done, frames in all); polled between frames
-    topology : of another set of the same body, as which polygons are cut
+    clip : name of one animation of a scene; None for all
+    fps : frames per second; None for the clip's keys, at most 30 per second. Not for point caches,
+        whose frames are fixed.
+    job : reports (frames done, all frames); polled between frames
+    topology : topology of another set of the same body, whose triangulation of polygons is used
 
     Raises
     ------
-    MeshFileError : a file cannot be read, has no animation or none of that name, or the mesh of a
-        point cache is missing or has another number of vertices.
+    MeshFileError : a file cannot be read, has no animation or none of that name, a point cache is
+        given a clip or a frame rate, or its mesh is missing or has another number of vertices.
     CancelledError : the job was cancelled.
     """
     if path.suffix.lower() not in POINT_CACHE_SUFFIXES:
@@ -88,9 +88,9 @@ def read_animated(
 
 
 def frame_rate(path: Path, clip: str | None) -> float | None:
-    """Return the frames a second of a point cache, or of a clip of a scene.
+    """Return the frames per second of a point cache, or of a clip of a scene.
 
-    None where the file does not say it.
+    None if the file does not define it.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def _read_clips(
 
 
 def labels_of(scene: Scene, mesh: JoinedMesh) -> npt.NDArray[np.str_] | None:
-    """Return the (V,) names of the body parts by the nodes that move them; None without joints."""
+    """Return the (V,) body parts of the vertices by the nodes that move them; None if unskinned."""
     if not mesh.is_skinned.any():
         return None
     order = parents_first(scene.parents)
@@ -167,7 +167,7 @@ def labels_of(scene: Scene, mesh: JoinedMesh) -> npt.NDArray[np.str_] | None:
 
 
 def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
-    """Read a point cache, and as pose 0 the mesh beside it."""
+    """Read a point cache, with the mesh beside it as pose 0."""
     beside = [path.with_suffix(suffix) for suffix in READABLE_SUFFIXES]
     files = [file for file in beside if file.is_file()]
     if not files:
@@ -177,7 +177,7 @@ def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
             where=path,
         )
     frames = read_point_cache(path)
-    # Formats that split vertices would have them put into another order than the frames'.
+    # Reordering to a topology, as for formats that split vertices, would not match the frames.
     is_plain = FILES[files[0].suffix.lower()].keeps_order
     mesh = read_mesh(files[0], topology=topology if is_plain else None)
     n_vertices = frames.shape[1]
@@ -185,7 +185,7 @@ def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
     if scene is not None and n_vertices != mesh.topology.n_vertices:
         joined = join_parts(scene).joined
         if len(joined) == n_vertices:
-            # Of the file's own vertices, those that seams split among them.
+            # The cache has the file's own vertices, before joining at seams: keep one of each.
             frames = frames[:, np.unique(joined, return_index=True)[1]]
     if mesh.topology.n_vertices != frames.shape[1]:
         raise MeshFileError(
@@ -206,7 +206,7 @@ def _up_axis(scene: Scene | None) -> int | None:
 
 
 def _require_same_body(path: Path, file: Path, mesh: Mesh, frame: FloatArray) -> None:
-    """Refuse a first frame of a cache whose vertices are not the mesh's, or in another unit."""
+    """Refuse a cache whose first frame has another unit or vertex order than the mesh."""
     known, lengths = (mesh.topology.edge_lengths(vertices) for vertices in (mesh.vertices, frame))
     scale = scale_of(lengths, known)
     tiny = np.finfo(np.float64).tiny
@@ -218,7 +218,7 @@ def _require_same_body(path: Path, file: Path, mesh: Mesh, frame: FloatArray) ->
         )
     known = known / max(body_size(mesh.vertices, mesh.topology), tiny)
     lengths = lengths / max(body_size(frame, mesh.topology), tiny)
-    # Whichever of the two has the vertices in the order of the faces.
+    # Either of the two may be the one whose vertices do not match the faces.
     if is_torn(lengths, known) or is_torn(known, lengths):
         raise MeshFileError(
             f"has a different vertex order from {file.name}",

@@ -28,7 +28,7 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> tuple[str, ...
 
     Returns
     -------
-    problems : a sentence for each kind of defect; several parts are no defect
+    problems : a sentence for each kind of defect; having several components is no defect
 
     Raises
     ------
@@ -91,12 +91,12 @@ def inspect_pose_set(
     path: str | os.PathLike[str],
     job: Job = UNWATCHED,
 ) -> PoseSetInspection:
-    """Read what can be read of a pose set and list every defect instead of refusing at the first.
+    """Read the usable poses of a pose set and list every defect instead of raising the first.
 
     Parameters
     ----------
-    path : as for `read_pose_set`
-    job : reports (poses done, poses in all)
+    path : see `read_pose_set`
+    job : reports (poses done, all poses)
 
     Returns
     -------

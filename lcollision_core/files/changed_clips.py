@@ -1,4 +1,4 @@
-"""A character's glTF file with frames of its clips changed, and what readers then see."""
+"""Change frames of the clips in a character's glTF file, and evaluate them as readers would."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from lcollision_core.files.scene_files import as_file_error, scene_of
 from lcollision_core.meshes.topology import FloatArray
 
 _UNCHANGED = 1e-9
-"""Of a joint's turn, or its shift in the character's unit: what is less is rounding."""
+"""Largest entry of a joint's turn, or shift in the character's unit, that is rounding error."""
 
 _AT_ONCE = 16
-"""Frames that are evaluated together."""
+"""Number of frames that are evaluated together."""
 
 
 _SpanTimes = tuple[float | None, FloatArray, float | None]
@@ -32,16 +32,16 @@ _SpanTimes = tuple[float | None, FloatArray, float | None]
 
 @dataclass(frozen=True, eq=False)
 class ChangedClip:
-    """The frames of one clip that are to be changed.
+    """A change to some frames of one clip.
 
     Attributes
     ----------
-    clip : its name
-    times : (T,) float64 array, of its frames, in seconds
-    spans : of frames that change
-    before, after : (n, J, 4, 4) float64 arrays of the n frames of the spans, in their order: global
-        transforms of the rig's joints by the pose space, without and with the change
-    shapes : (n, S) by how much the sliders of morph targets change there; None where they do not
+    clip : name of the clip
+    times : (T,) float64 array, times of its frames in seconds
+    spans : ranges of frames that change
+    before, after : (n, J, 4, 4) float64 arrays, for the n frames of the spans in order: global
+        transforms of the rig's joints by the pose space, before and after the change
+    shapes : (n, S) changes of the sliders of morph targets; None if there are none
     """
 
     clip: str
@@ -52,7 +52,7 @@ class ChangedClip:
     shapes: FloatArray | None = None
 
     def spans_in_time(self) -> Iterator[tuple[slice, _SpanTimes]]:
-        """Yield of each span its rows, and the times before, in and after it: see `with_span`."""
+        """Yield each span's rows, and the times before, in and after it: see `with_span`."""
         start = 0
         for span in self.spans:
             before = float(self.times[span.start - 1]) if span.start else None
@@ -66,19 +66,19 @@ def changed_gltf(character: Character, changes: Sequence[ChangedClip]) -> bytes:
     """Turn the joints of a character in some frames of its clips.
 
     Only the rotations of joints that turn, and the translation of a root that is shifted, get new
-    keys, and only within the spans; what else a clip holds there (scales, stretched bones) stays,
-    and the joint turns as far from where the clip has it as the pose does. Outside of the spans
-    each value stays what it was: linear keys as they are, cubic ones with their tangents, stepped
-    ones as pairs of linear keys. Other clips and all else of the file stay as they were.
+    keys, and only within the spans. Everything else in the clip (scales, stretched bones) stays,
+    and joints turn relative to their transforms in the clip. Outside the spans the values are
+    unchanged: linear keys are kept, cubic ones keep their tangents, stepped ones become pairs of
+    linear keys. Other clips and the rest of the file are unchanged.
 
     Parameters
     ----------
     character : with a rig, read from a .glb, .gltf or .vrm file
-    changes : of its clips
+    changes : the changes of its clips
 
     Returns
     -------
-    the file, as GLB
+    the file as GLB
 
     Raises
     ------
@@ -95,7 +95,7 @@ def changed_gltf(character: Character, changes: Sequence[ChangedClip]) -> bytes:
 
 
 def clip_vertices(data: bytes, path: Path, clip: str, times: FloatArray) -> Iterator[FloatArray]:
-    """Evaluate a clip of a written file: (V, 3) vertices at each time, as readers get them.
+    """Evaluate a clip of a written file as readers do, and yield (V, 3) vertices for each time.
 
     Raises
     ------
@@ -150,13 +150,13 @@ def _change(file: CharacterFile, patch: GltfDocument, rig: Rig, change: ChangedC
 
 
 def _unscaled(turns: FloatArray, sizes: FloatArray) -> FloatArray:
-    """Return (n, 3, 3) turns of joints that are scaled by (n, 3) before as turns after that."""
+    """Conjugate (n, 3, 3) turns, applied before (n, 3) scales, to apply after them."""
     held = np.where(np.abs(sizes) > _UNCHANGED, sizes, 1.0)
     return held[:, :, None] * turns / held[:, None, :]
 
 
 def _local_turns(rig: Rig, change: ChangedClip) -> FloatArray:
-    """Return by how much each joint turns further, in its own frame: (S, J, 4, 4)."""
+    """Return the additional turn of each joint in its local frame: (n, J, 4, 4)."""
 
     def local(transforms: FloatArray) -> FloatArray:
         parents = rig.own_parents
@@ -168,7 +168,7 @@ def _local_turns(rig: Rig, change: ChangedClip) -> FloatArray:
 
 
 def _put(patch: GltfDocument, animation: dict[str, Any], node: int, track: Track) -> None:
-    """Give a property of a node its keys in an animation, by one channel."""
+    """Set the keys of a node's property in an animation, with a single channel."""
     animation["samplers"].append(
         {
             "input": patch.add_array(track.times[:, None], has_bounds=True),
@@ -187,7 +187,7 @@ def _put(patch: GltfDocument, animation: dict[str, Any], node: int, track: Track
             others.append(one)
     number = len(animation["samplers"]) - 1
     animation["channels"] = [*others, channel | {"sampler": number}]
-    # What is animated has no matrix.
+    # Animated nodes must not have a matrix.
     moved = patch.description["nodes"][node]
     if "matrix" in moved:
         parts = dict(zip(PARTS, stored_parts(moved), strict=True))

@@ -1,4 +1,4 @@
-"""A character as its file has it: joined meshes, a rig, clips, and the file itself."""
+"""A character read from a file: joined meshes, a rig, clips, and the file itself."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ IDENTITY = np.eye(4)
 class CharacterFile:
     """The content of a character's file, read once.
 
-    What writing needs beyond it is made when it is asked for, of a .glb, .gltf or .vrm file alone;
-    it raises `MeshFileError` where the file is damaged.
+    The properties needed for writing are computed on demand, for .glb, .gltf and .vrm files only;
+    they raise `MeshFileError` if the file is damaged.
 
     Attributes
     ----------
-    scene : without scenery
-    mesh : of its parts
+    scene : the scene without scenery
+    mesh : the joined mesh of its parts
     """
 
     scene: Scene
@@ -44,7 +44,7 @@ class CharacterFile:
 
     @cached_property
     def appearance(self) -> Appearance | None:
-        """How it looks; None where the file does not say that."""
+        """Appearance of the mesh; None if the file does not define it."""
         return look_of(self.scene, self.mesh)
 
     @cached_property
@@ -55,7 +55,7 @@ class CharacterFile:
 
     @property
     def document(self) -> GltfDocument:
-        """The file itself."""
+        """The glTF file itself."""
         document: GltfDocument | None = self.scene.document
         if document is None:
             raise MeshFileError("is no glTF file", where="it")
@@ -63,7 +63,7 @@ class CharacterFile:
 
     @cached_property
     def editable(self) -> GltfDocument:
-        """The file to be written, in the rest pose of the scene; copies of it are changed."""
+        """The file to write, in the rest pose of the scene; copy it before changing it."""
         document = self.document.editable()
         rest = self.scene.rest.transforms[0]
         for number in self.scene.revealed:
@@ -83,7 +83,7 @@ class CharacterFile:
 
     @cached_property
     def parts(self) -> list[tuple[Part, Primitive, slice]]:
-        """Each part, what it is in the file, and its rows of the file's vertices."""
+        """Each part with its primitive in the file and its rows of the file's vertices."""
         parts, start = [], 0
         for part in self.scene.parts:
             if part.primitive is not None:
@@ -93,7 +93,7 @@ class CharacterFile:
 
     @cached_property
     def stored_normals(self) -> list[FloatArray | None]:
-        """The normals that the file stores for the vertices of each part, (n, 3)."""
+        """The (n, 3) normals that the file stores for each part's vertices, None if it has none."""
         return list(self._stored_normals())
 
     def _stored_normals(self) -> Iterator[FloatArray | None]:
@@ -108,7 +108,7 @@ class CharacterFile:
             yield np.tile(as_float(stored), (shown.n_instances, 1))
 
     def normals(self, vertices: FloatArray) -> FloatArray:
-        """Return the unit normals of the file's W vertices in a pose; 0 where it has none."""
+        """Return the unit normals of the file's W vertices in a pose; 0 where none are stored."""
         return moved_normals(*self._normals_at_rest, self.rest, vertices)
 
     @cached_property
@@ -122,7 +122,7 @@ class CharacterFile:
             if stored is not None:
                 turns = np.linalg.pinv(blended(part, transforms)[:, :, :3])
                 rest[rows] = unit(np.einsum("vij,vi->vj", turns, stored))
-        # All triangles of the joined vertex, so that the copies at a seam move alike.
+        # Use all triangles of the joined vertex, so that copies at a seam get equal normals.
         faces = self.mesh.topology.faces.astype(np.int64)
         corners = np.concatenate([np.roll(faces, -side, axis=1) for side in range(3)])
         corners = corners[np.argsort(corners[:, 0], kind="stable")]
@@ -143,21 +143,21 @@ def blended(part: Part, transforms: FloatArray) -> FloatArray:
 
 
 NO_JOINTS = "has no joints to pose it by"
-"""What is wrong with a file without a skin where a rig is needed."""
+"""The problem with a file without a skin when a rig is needed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """What a character's sliders add to the weights of its file's morph targets, linearly.
+    """Sliders of a character, which add to the weights of its file's morph targets linearly.
 
     Attributes
     ----------
-    names : of S sliders, unique
+    names : S unique names of the sliders
     low, high : (S,) float64 arrays, the ends of their ranges; 0 is the rest pose
-    mixes : of each part of the scene the (S, M) weights that each slider adds
-    sources : (S, 2) int64 array, the part and the morph target whose weight alone a slider is; -1
-        of those that mix several, as expressions do
-    deltas : (3 n, S), what each adds to the n `Rig.points` whose weight is above 0
+    mixes : for each part of the scene, the (S, M) weights that each slider adds
+    sources : (S, 2) int64 array, the part and morph target whose weight a slider is; -1 for sliders
+        that mix several targets, as expressions do
+    deltas : (3 n, S), offsets that each slider adds to the n `Rig.points` of weight above 0
     """
 
     names: tuple[str, ...]
@@ -169,27 +169,28 @@ class Shapes:
 
     @cached_property
     def by_row(self) -> csr_matrix:
-        """The same as `deltas`, row by row."""
+        """`deltas` in CSR form."""
         return self.deltas.tocsr()
 
     def offsets(self, numbers: FloatArray) -> FloatArray:
-        """Return what (S,) numbers of the sliders add to the points, (n, 3), in the file's unit."""
+        """Return the (n, 3) offsets of the points for (S,) slider values, in the file's unit."""
         used = np.flatnonzero(numbers)
         added: FloatArray = (self.deltas[:, used] @ numbers[used]).reshape(-1, 3)
         return added
 
     def weights(self, numbers: FloatArray, at_rest: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
-        """Return the (N, M) weights of each part's morph targets, of (N, S) sliders.
+        """Return the (N, M) weights of each part's morph targets for (N, S) slider values.
 
         Parameters
         ----------
-        at_rest : of each part the (1, M) weights in the rest pose
+        numbers : (N, S) slider values
+        at_rest : for each part, the (1, M) weights in the rest pose
         """
         both = zip(at_rest, self.mixes, strict=True)
         return tuple(rest + numbers @ mix for rest, mix in both)
 
     def numbers(self, weights: Sequence[FloatArray], at_rest: Sequence[FloatArray]) -> FloatArray:
-        """Return the (N, S) sliders of the weights of N poses: those of single targets."""
+        """Return the (N, S) slider values for the weights of N poses; 0 for mixing sliders."""
         numbers = np.zeros((len(weights[0]), len(self.names)))
         for slider, (part, target) in enumerate(self.sources.tolist()):
             if part >= 0:
@@ -209,27 +210,27 @@ class Rig:
     joint_names : J names as in the file, unique
     parents : (J,) int64 array, each joint's parent, -1 for a root; parents come before children
     rest : (J, 4, 4) float64 array, the joints' global transforms in the rest pose, in the
-        character's frame and unit
+        character's coordinates and unit
     nodes : (J,) int64 array, the number of each joint's node in the file
     joint_of : (V, I) int32 array, the joints that move each vertex
     weights : (V, I) float64 array >= 0, each row sums to 1
-    points : (V, I, 3) float64 array: where each of these joints alone has the vertex in the rest
-        pose; all the same where the rest pose is the bind pose
-    chosen : what the user says that joints are, by their names: of `anatomy.ROLE_NAMES`
-    followed : by the names of joints, those of another skeleton's that they are to follow in its
-        motions, None for none; where the user says so
-    stretch : (J, 3, 3) float64 array, positive definite: how what is above each joint is scaled at
-        rest, P of the polar decomposition P Q of its linear part, the largest scale 1. Turning the
-        joint in its file by R then turns the vertices by P Q R (P Q)^-1, which is a rotation only
-        for P = 1. None where all are 1.
-    moving : (J,) bool array, joints that turn about any axis; the others do not turn. None where
-        what a joint is says how it turns.
-    pose_shapes : (V, 3, 9 (J - 1)) float32 array, what each entry of R - I adds to `points`, of the
-        rotations R of all joints but the first against their parents, in the character's axes, row
-        by row (the pose blend shapes of SMPL). None where poses shape nothing.
-    file_parents : (J,) int64 array, each joint's parent in the file, which may come later; None
-        where all are `parents`: see `loose_ends`
-    shapes : what the morph targets of the file add to `points`; None where it has none
+    points : (V, I, 3) float64 array, the rest position of the vertex by each of these joints alone;
+        all equal if the rest pose is the bind pose
+    chosen : roles of joints set by the user, by joint name: see `anatomy.ROLE_NAMES`
+    followed : joints of another skeleton whose motion joints follow, None to follow none, by joint
+        name, as set by the user
+    stretch : (J, 3, 3) float64 array, positive definite: scale of each joint's parent at rest, P of
+        the polar decomposition P Q of its linear part, the largest scale 1. Turning the joint in
+        its file by R then turns the vertices by P Q R (P Q)^-1, which is a rotation only for P = 1.
+        None if all are 1.
+    moving : (J,) bool array, joints that turn about any axis; the others do not turn. None if the
+        role of a joint determines how it turns.
+    pose_shapes : (V, 3, 9 (J - 1)) float32 array, offsets of `points` by each entry of R - I, for
+        the rotations R of all joints but the first relative to their parents, in the character's
+        axes, row by row (the pose blend shapes of SMPL). None if there are none.
+    file_parents : (J,) int64 array, each joint's parent in the file, which may come later; None if
+        these are `parents`: see `with_ends_on_limbs`
+    shapes : offsets of `points` by the file's morph targets; None if it has none
     """
 
     joint_names: tuple[str, ...]
@@ -259,15 +260,15 @@ class ClipFrames:
 
     Attributes
     ----------
-    clip : its name
-    names : N names, as "moves 12", numbered from 0 by frame
+    clip : name of the clip
+    names : N names such as "moves 12", numbered from 0 by frame
     times : (N,) float64 array, in seconds
     transforms : (N, J, 4, 4) float64 array, global transforms of the rig's joints; None without rig
-    skin : makes `vertices`, which takes long
-    points : of frames in which the rig has other `points` than at rest, as they hide a part, move
-        it on its joint or weigh morph targets as no sliders do, what makes these (V, I, 3), to
-        which the sliders add; the same for frames that share them
-    shapes : (N, S) float64 array, the sliders of `Rig.shapes`; None where there are none
+    skin : computes `vertices`, which is slow
+    points : by frame, functions that compute (V, I, 3) `Rig.points`, without the sliders' offsets,
+        for frames that hide a part, move it relative to its joint or weight morph targets as no
+        sliders do; frames with equal points share a function
+    shapes : (N, S) float64 array, sliders of `Rig.shapes`; None if there are none
     """
 
     clip: str
@@ -280,34 +281,34 @@ class ClipFrames:
 
     @cached_property
     def vertices(self) -> FloatArray:
-        """(N, V, 3) float64 array, as the file says, in the character's frame and unit."""
+        """(N, V, 3) float64 array, as the file has them, in the character's frame and unit."""
         return self.skin()
 
 
 @dataclass(frozen=True, eq=False)
 class Character:
-    """A character, its vertices at equal places with equal weights in all frames joined.
+    """A character, whose vertices are joined where position and weights are equal in all frames.
 
     Attributes
     ----------
-    name : the file's, without extension
+    name : name of the file without extension
     source : its file
-    topology : of the joined vertices; faces that joining makes degenerate are left out
+    topology : faces of the joined vertices, without those that joining makes degenerate
     rest_vertices : (V, 3) float64 array, the rest pose in the file's frame and unit
     joined : (W,) int64 array: the joined vertex of each of the file's W vertices, in the order of
         the file's meshes and primitives
-    up : (3,) float64 array, a signed unit axis: what the file says, else a guess
-    up_is_sure : whether the file says so, or the guess leaves no doubt
+    up : (3,) float64 array, a signed unit axis from the file, else a guess
+    up_is_sure : whether the file defines it, or the guess leaves no doubt
     metres : length of the file's unit
-    groups : named meshes and materials, of the joined faces
-    rig : None for one without joints
-    clips : lengths in seconds of its animations, by their names
-    sample : (clip, fps) to its frames; None for the clip's own key frames at at most 30 a second,
-        an array for frames at (N,) times
-    notes : sentences on what was changed on reading
-    no_rig : what is wrong with the file where `rig` is None
-    file : what was read of it; None for one that is not from a file of a scene
-    smpl : the body model that it has its shape of; None of other files
+    groups : named meshes and materials, as groups of the joined faces
+    rig : None for a character without joints
+    clips : lengths of its animations in seconds, by name
+    sample : returns the frames for (clip, fps); fps is None for the clip's own keys at most 30 a
+        second, or an array of (N,) times
+    notes : sentences on changes made on reading
+    no_rig : the reason why `rig` is None
+    file : content of the file; None if it is not the file of a scene
+    smpl : the body model that gives it its shape; None for other files
     """
 
     name: str
@@ -328,7 +329,7 @@ class Character:
     smpl: SmplModel | None = None
 
     def look(self) -> Appearance | None:
-        """Read how it looks, which takes long the first time; None where no file says that.
+        """Read its appearance, which is slow the first time; None if no file defines it.
 
         Raises
         ------
@@ -340,7 +341,7 @@ class Character:
             return self.file.appearance
 
     def rate(self, clip: str) -> float:
-        """Return how many frames a second a clip has: see `Clip.rate`; it raises as `sample`."""
+        """Return the frames per second of a clip: see `Clip.rate`; raises as `sample` does."""
         clips = () if self.file is None else self.file.scene.clips
         with as_file_error(self.source):
             return next(

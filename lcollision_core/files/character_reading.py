@@ -1,4 +1,4 @@
-"""Read a character from its file, of whatever format, and make a glTF file of it."""
+"""Read a character from a file of any format, and convert it to glTF."""
 
 from __future__ import annotations
 
@@ -44,32 +44,32 @@ from lcollision_core.meshes.units import body_size, box_corners
 from lcollision_core.meshes.upright import guess_up
 
 _NEAR, _NEARLY = 0.05, 1.5
-"""Normalised length: a piece of its own, as of a robot, is joined to what is nearest, if that is
-nearer than this, and to what is hardly farther."""
+"""Separate pieces, as of a robot, adjoin vertices within the first distance, normalised, and within
+the second one times that of the nearest vertex."""
 
 _AT_END = 0.2
-"""Normalised length: a loose joint is no farther from the skin of the limb that it ends."""
+"""Largest distance of a loose joint from the skin of the limb that it ends, normalised."""
 
 _SAME_PLACE = 0.02
-"""Normalised length: of two joints that are in one place."""
+"""Largest distance of two joints in the same place, normalised."""
 
 _LEAST_CHAIN = 2
-"""Joints that lead vertices, of a limb: a knee at least bends before its end."""
+"""Fewest joints of a limb that lead vertices: a limb has at least a knee before its end."""
 
 
 def with_ends_on_limbs(
     rig: Rig, topology: Topology, rest_vertices: FloatArray, body_size: float
 ) -> tuple[Rig, tuple[str, ...]]:
-    """Hang each loose end of a limb on the limb, so that it follows, and pulls it by a drag.
+    """Attach each loose end of a limb to the limb, so that they move together.
 
-    A paw or foot is loose where it hangs on what all hangs on, its surface goes on in another
-    joint's that ends a limb, and in that of none that it hangs on. What poses say of the joints, as
-    global transforms, is as before.
+    A paw or foot is loose if it hangs on the root beside its limb, and its surface continues in
+    that of the last joint of a limb but in that of none of its ancestors. The joints' global
+    transforms in poses are not affected.
 
     Parameters
     ----------
     rig, topology, rest_vertices : of the character, in its unit
-    body_size : in that unit
+    body_size : in the same unit
 
     Returns
     -------
@@ -118,7 +118,7 @@ def with_ends_on_limbs(
 def _hanging_on_nothing(
     rig: Rig, n_led: npt.NDArray[np.int64], carries: npt.NDArray[np.bool_]
 ) -> list[int]:
-    """Return the joints that carry few of the vertices, below joints that lead none."""
+    """Return the joints that carry less than half the vertices, below joints that lead none."""
     carried = carries @ n_led
     return [
         joint
@@ -136,9 +136,9 @@ def _joined(
     n_joints: int,
     near: float,
 ) -> npt.NDArray[np.int64]:
-    """Count of each joint the vertices at which some vertices' surface goes on, (J,).
+    """Count, per joint, the vertices that adjoin the vertices `inside`, (J,).
 
-    Where it goes on nowhere, those that are near.
+    If none does, count nearby vertices.
     """
     edges = topology.edges
     across = edges[inside[edges[:, 0]] != inside[edges[:, 1]]]
@@ -161,14 +161,14 @@ def _end(
     carries: npt.NDArray[np.bool_],
     near: float,
 ) -> int:
-    """Return the last joint of a limb at which a loose one's surface goes on, or its place is."""
+    """Return the last joint of the limb that adjoins the surface or position of a loose one."""
     away = np.linalg.norm(rig.rest[:, :3, 3] - rig.rest[loose, :3, 3], axis=1)
     below = carries[joined.argmax()] & (n_led > 0) & ((joined > 0) | (away <= near))
     return int(np.flatnonzero(below)[-1])
 
 
 def _in_order(rig: Rig) -> Rig:
-    """Return a rig whose joints come after their parents again."""
+    """Reorder the joints of a rig so that parents come before children."""
     order = np.array(parents_first(rig.parents))
     number = np.empty(len(order) + 1, dtype=np.int64)
     number[order], number[-1] = np.arange(len(order)), -1
@@ -188,12 +188,12 @@ def _in_order(rig: Rig) -> Rig:
 def character_of_smpl(
     model: SmplModel, betas: FloatArray | None = None, moving: Container[str] | None = None
 ) -> Character:
-    """Make a character of a body model, whose joints turn about any axis.
+    """Make a character from a body model, whose joints turn about any axis.
 
     Parameters
     ----------
-    betas : (n,) the shape; the mean shape if None, as where the model has fewer numbers
-    moving : names of the joints that turn; all if None
+    betas : (n,) shape, of which numbers beyond the model's are ignored; None for the mean shape
+    moving : names of the joints that turn; None for all
     """
     shape = np.zeros(0) if betas is None else betas[: model.shape_directions.shape[2]]
     vertices, joints = model.shaped(shape)
@@ -234,16 +234,17 @@ def character_of_smpl(
 
 
 _HIDDEN = 1e-3
-"""Of its scale at rest, below which a part is hidden."""
+"""Fraction of its scale at rest below which a part is hidden."""
 
 _SAME = 1e-5
-"""Of the body size: what a joint holds of a part to so much, it holds."""
+"""Largest deviation, in body sizes, that is ignored: of a part from its joint, or of a written rest
+pose."""
 
 _SAME_WEIGHT = 1e-6
-"""Of a morph target: what differs less is rounding."""
+"""Largest difference of morph target weights that is rounding error."""
 
 _EVEN = 1e-6
-"""By which scales along different axes may differ and are rounding."""
+"""Largest relative difference of scales along different axes that is rounding error."""
 
 
 def read_character(
@@ -255,15 +256,15 @@ def read_character(
 
     Parameters
     ----------
-    source : a .glb, .gltf, .vrm or .fbx file, or what `open_scene` read of it; or the .npz file of
-        a body model of the SMPL family
-    up : the up axis where the file is wrong about it: 0, 1, 2, "x", "y" or "z"
-    topology : of a model of the character, as which polygons are cut
+    source : a .glb, .gltf, .vrm or .fbx file, or the result of `open_scene`; or the .npz file of a
+        body model of the SMPL family
+    up : up axis, 0, 1, 2, "x", "y" or "z", if the file's is wrong
+    topology : topology of a model of the character, whose triangulation of polygons is used
 
     Raises
     ------
     MeshFileError : the file is missing, damaged, compressed or too large, or shows no triangles.
-        The sentence names the file. A damaged clip is left out, or refused when it is sampled.
+        The message names the file. A damaged clip is left out, or refused when it is sampled.
     MissingExtraError : the extra `fbx`, which reads FBX, is not installed.
     ShapeError : `up` is no axis.
     """
@@ -276,12 +277,12 @@ def read_character(
 
 
 def turned(character: Character, axis: int) -> Character:
-    """Return a character whose axis 0, 1 or 2 is up, whatever its file says."""
+    """Return a character with the up axis 0, 1 or 2, whatever its file says."""
     return replace(character, up=np.eye(3)[axis], up_is_sure=True)
 
 
 def as_read(character: Character) -> Character:
-    """Return a character as its file has it, without what was chosen for it."""
+    """Return a character as in its file, without the user's choices of up axis and roles."""
     if character.smpl is not None and character.rig is not None:
         return turned(replace(character, rig=replace(character.rig, chosen={})), 1)
     if character.file is None or character.rig is None:
@@ -299,17 +300,17 @@ def _up(scene: Scene, mesh: JoinedMesh, rest_vertices: FloatArray) -> tuple[Floa
 
 
 def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> Character:
-    """Make a character of what a file shows.
+    """Make a character from the scene of a file.
 
     Parameters
     ----------
-    scene : without scenery
-    path : of the file
-    topology : of a model of the character, as which polygons are cut
+    scene : the scene without scenery
+    path : path of the file
+    topology : topology of a model of the character, whose triangulation of polygons is used
 
     Raises
     ------
-    MeshFileError : it is damaged.
+    MeshFileError : the scene is damaged.
     """
     with as_file_error(path):
         mesh = join_parts(scene).cut_as(topology)
@@ -354,7 +355,7 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
 
 
 def _clip_lengths(scene: Scene) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return `Character.clips`, and sentences on clips whose key times are damaged."""
+    """Return `Character.clips`, and notes on clips whose key times are damaged."""
     lengths, notes = {}, []
     for clip in scene.clips:
         try:
@@ -372,9 +373,9 @@ def _points_of_frames(
     poses: ScenePoses,
     numbers: FloatArray | None,
 ) -> dict[int, Callable[[], FloatArray]]:
-    """Return `ClipFrames.points`: of parts that are hidden or move on their joint.
+    """Return `ClipFrames.points` for frames in which parts are hidden or move on their joint.
 
-    So are frames that weigh morph targets otherwise than the (N, S) numbers of the sliders.
+    Include frames whose morph target weights differ from those of the (N, S) slider values.
     """
     is_own = np.zeros(len(poses.transforms), dtype=np.bool_)
     held_by = scene.rest.weights
@@ -390,12 +391,12 @@ def _points_of_frames(
     least = _HIDDEN * np.linalg.norm(rest[moved, :3, :3], axis=(1, 2))
     sizes = np.linalg.norm(poses.transforms[:, moved, :3, :3], axis=(2, 3))
     is_own |= (sizes < least).any(axis=1)
-    # What hangs on a joint may yet have a motion of its own where a clip shows and hides it.
+    # A part fixed to a joint may still move on it, in clips that show and hide the part.
     carried = used[carrier[used] != mesh.bones[used]]
     transforms = np.broadcast_to(rest[mesh.bones], (len(is_own), len(mesh.bones), 4, 4)).copy()
     for bone in carried.tolist():
         node, joint = mesh.bones[bone], carrier[bone]
-        # A joint may have no size.
+        # A joint's transform may be singular.
         back = rest[joint] @ np.linalg.pinv(poses.transforms[:, joint])
         now = back @ poses.transforms[:, node]
         at = mesh.bind[bone] @ box_corners(mesh.points[(mesh.bone_of == bone).any(axis=1)])
@@ -420,7 +421,7 @@ def _points_of_frames(
 
 
 def _shapes(scene: Scene, mesh: JoinedMesh, weights: FloatArray) -> Shapes | None:
-    """Return what the sliders of the parts add to the points of a rig of (V, I) weights."""
+    """Return the sliders of the parts, for a rig of (V, I) weights; None if none has an effect."""
     names = tuple(dict.fromkeys(name for part in scene.parts for name in part.sliders))
     if not names:
         return None
@@ -457,7 +458,8 @@ def _shapes(scene: Scene, mesh: JoinedMesh, weights: FloatArray) -> Shapes | Non
         alone = ((mix != 0.0).sum(axis=1) == 1) & (mix.max(axis=1, initial=0.0) == 1.0)
         for slider in np.flatnonzero(alone & (sources[:, 0] < 0)).tolist():
             target = int(mix[slider].argmax())
-            # Of two names of one target, clips move the second, as the first is an expression.
+            # If two sliders are the same target, clips set the second, as the first is an
+            # expression.
             sources[(sources == [number, target]).all(axis=1)] = -1
             sources[slider] = number, target
             low[slider], high[slider] = np.array([0.0, 1.0]) - at_rest[0, target]
@@ -489,7 +491,7 @@ def _axis(up: int | str) -> int:
 def _rig(
     scene: Scene, mesh: JoinedMesh, rest_vertices: FloatArray, size: float
 ) -> tuple[Rig | None, tuple[str, ...]]:
-    """Return the skeleton of what is skinned, and notes."""
+    """Return the rig of the skinned parts, None without a usable one, and notes."""
     in_skins = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
     if not in_skins:
         return None, ()
@@ -507,7 +509,7 @@ def _rig(
         if node in used or (node in in_skins and is_regular(rest[node]))
     ]
     joint = {node: number for number, node in enumerate(order)}
-    # A bone of no weight may be no joint.
+    # A bone without weight need not be a joint.
     joint_of_bone = np.array([joint.get(anchors[bone], 0) for bone in mesh.bones.tolist()])
     weights = tuple(of_part[0] for of_part in scene.rest.weights)
     at_rest = _points(scene, mesh, rest[mesh.bones], weights)
@@ -532,7 +534,7 @@ def _rig(
 
 
 def _stretch(scene: Scene, order: list[int]) -> FloatArray | None:
-    """Return `Rig.stretch` of the nodes that are joints."""
+    """Return `Rig.stretch` for the joints' nodes."""
     above = np.broadcast_to(np.eye(3), (len(order), 3, 3)).copy()
     for number, node in enumerate(order):
         if scene.parents[node] >= 0 and node not in scene.unscaled:
@@ -552,10 +554,10 @@ def _parent_joint(scene: Scene, node: int, joint: dict[int, int]) -> int:
 
 
 def _anchors(scene: Scene, in_skins: set[int]) -> dict[int, int]:
-    """Return for each node that moves vertices the one that is to be the joint.
+    """Return the node that serves as the joint of each node that moves vertices, -1 if none can.
 
-    What hangs on a joint of a skin without moving in any clip is part of that joint, and so is what
-    a node scaled to nothing moves, as accessories are hidden.
+    A node below a joint of a skin that no clip moves is part of that joint, and so is a node of
+    zero scale, which is how accessories are hidden.
     """
     moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
     rest = scene.rest.transforms[0]
@@ -568,22 +570,19 @@ def _anchors(scene: Scene, in_skins: set[int]) -> dict[int, int]:
     return anchors
 
 
-"""Of the body size: how far its rest pose may be off without a word."""
-
-
 @dataclass(frozen=True, eq=False)
 class GltfCharacter:
-    """A character as a glTF file has it, beside the one that was read.
+    """A character converted to glTF, and how it maps to the original.
 
     Attributes
     ----------
-    character : to be written; the one that was read where that is of a glTF file
-    frame : from the coordinates that were read to those of the glTF file
-    from_read : (V',) int64 array, for each of its vertices the one that was read
-    to_read : (V,) int64 array, the other way
-    joints : (J,) int64 array, for each joint of its rig the one that was read
-    delays : seconds by which its clips begin later, by their names
-    notes : sentences on what a file that is written lacks
+    character : the converted character; the original if that is from a glTF file
+    frame : transform from the original's coordinates to those of the glTF file
+    from_read : (V',) int64 array, the original vertex of each of its vertices
+    to_read : (V,) int64 array, the inverse map
+    joints : (J,) int64 array, the original joint of each joint of its rig
+    delays : seconds by which its clips begin later, by name
+    notes : sentences on what the written file lacks
     """
 
     character: Character
@@ -596,11 +595,11 @@ class GltfCharacter:
 
 
 def as_gltf(character: Character) -> GltfCharacter:
-    """Return a character as the glTF file that gives it back, made of what was read of another.
+    """Convert a character from a file of another format to glTF; keep one from a glTF file.
 
     Raises
     ------
-    MeshFileError : its file is damaged, or too large for GLB.
+    MeshFileError : its file is damaged, too large for GLB, or would lose parts or joints.
     """
     joints = np.arange(0 if character.rig is None else len(character.rig.nodes))
     rows = np.arange(len(character.rest_vertices))
@@ -643,12 +642,12 @@ def as_gltf(character: Character) -> GltfCharacter:
 
 
 def is_gltf(character: Character) -> bool:
-    """Whether a character was read from a glTF file, which exports give back as it is."""
+    """Whether a character was read from a glTF file, which exports keep as it is."""
     return Path(character.source).suffix.lower() in GLTF_SUFFIXES
 
 
 def written_frame(character: Character) -> RigidTransform:
-    """Return what brings a character's coordinates to those of the glTF file that is written."""
+    """Return the transform from a character's coordinates to those of its written glTF file."""
     if is_gltf(character):
         return RigidTransform(np.eye(3), np.zeros(3))
     return RigidTransform(turn_to_y(character.up), np.zeros(3), character.metres)

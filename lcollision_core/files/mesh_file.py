@@ -1,4 +1,4 @@
-"""Mesh files: OBJ, PLY, OFF, STL and scenes, read and written in unchanged vertex order."""
+"""Read and write mesh files (OBJ, PLY, OFF, STL and scenes) in unchanged vertex order."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ SINGLE_PRECISION = tuple(suffix for suffix, kind in FILES.items() if kind.is_sin
 """Formats that hold only float32; the others hold either precision."""
 
 LARGEST_RATIO = 0.01
-"""Largest rounding step of a coordinate, relative to a short edge: beyond it, faces lose their
+"""Largest rounding step of a coordinate, relative to a short edge. Above it, faces lose their
 shape, and results for a mesh do not hold for its file."""
 
 _SHORT_EDGES = 10.0
-"""Per cent of the edges that are at most as long as a short edge."""
+"""Percentile of the edge lengths that defines a short edge."""
 
 
 def rounding_step(
@@ -45,22 +45,21 @@ def rounding_step(
 
     Parameters
     ----------
-    vertices : (V, 3) finite array; those that no face uses do not count
-    topology : of the mesh
-    dtype : float32 or float64, which the coordinates are to be stored in
+    vertices : (V, 3) finite array; vertices that no face uses are ignored
+    topology : topology of the mesh
+    dtype : float32 or float64, in which the coordinates are stored
 
     Returns
     -------
     step : in the mesh's unit
-    ratio : the step over the length that a tenth of the edges have at most, those without length
-        aside; 0 where no edge has one
+    ratio : the step divided by the 10th percentile of the edge lengths above 0; 0 if there are none
     """
     used = np.asarray(vertices, dtype=np.float64)[topology.picked]
     farthest = float(np.abs(used).max())
-    # Beyond the largest number there is none to step to.
+    # The spacing of the largest number is infinite.
     nearer = min(farthest, float(np.finfo(dtype).max) / 2.0)
     step = float(np.spacing(np.asarray(nearer, dtype=dtype)))
-    # Measured as fractions of that, as no square of such a fraction overflows.
+    # Scale to at most 1, so that squares do not overflow.
     points = np.zeros((topology.n_vertices, 3))
     points[topology.picked] = used / (farthest or 1.0)
     lengths = topology.edge_lengths(points)
@@ -71,7 +70,7 @@ def rounding_step(
 
 
 def can_hold(vertices: npt.NDArray[Any], topology: Topology, dtype: npt.DTypeLike) -> bool:
-    """Tell whether rounding to a number format preserves the shape of a mesh at its location.
+    """Whether rounding to a number format preserves the shape of a mesh at its location.
 
     Parameters and terms are those of `rounding_step`.
     """
@@ -81,17 +80,17 @@ def can_hold(vertices: npt.NDArray[Any], topology: Topology, dtype: npt.DTypeLik
 def as_stored(
     path: str | os.PathLike[str], vertices: npt.NDArray[Any], topology: Topology
 ) -> npt.NDArray[Any]:
-    """Round vertices to what a mesh file of them holds.
+    """Round vertices to the precision of a mesh file.
 
     Parameters
     ----------
-    path : its extension says the format
+    path : its extension determines the format
     vertices : (V, 3) finite array
-    topology : of the mesh
+    topology : topology of the mesh
 
     Returns
     -------
-    stored : (V, 3) float32 array for formats of single precision, else as `vertices` is
+    stored : (V, 3) float32 array for formats of single precision, else of the type of `vertices`
 
     Raises
     ------
@@ -105,7 +104,7 @@ def as_stored(
             path, f"a coordinate exceeds float32, which {suffix} stores", "write .ply or .obj"
         )
     stored = np.asarray(vertices, dtype) if dtype is np.float32 else np.asarray(vertices)
-    # Already rounded: not rounded again.
+    # float32 vertices in a float32 format are not rounded again.
     if stored.dtype != vertices.dtype or stored.dtype == np.float64:
         step, ratio = rounding_step(vertices, topology, dtype)
         if ratio > LARGEST_RATIO:
@@ -122,7 +121,7 @@ def as_stored(
 _REORDERED = "vertices that had been split were put back into the set's vertex order"
 
 KEEP_PRECISION = "export it nearer to the origin, or with double precision"
-"""What to do about a mesh that `coarseness_of` has something to say of."""
+"""Advice for a mesh that `coarseness_of` reports."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,10 +132,10 @@ class Mesh:
     ----------
     vertices : (V, 3) float64 array, read-only, in the file's order and unit
     topology : its faces
-    source : the file that it was read from
+    source : its file
     notes : sentences on changes made on reading, such as the triangulation of quads
-    coarseness : what is lost where a file of single precision holds a mesh so far from the origin
-        that it cannot: a sentence, else None
+    coarseness : the loss, as a sentence, if single precision is too coarse so far from the origin;
+        else None
     """
 
     vertices: npt.NDArray[np.float64]
@@ -152,21 +151,20 @@ class Mesh:
 
 
 def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None) -> Mesh:
-    """Read one triangle mesh; its extension, in any case, says the format.
+    """Read one triangle mesh; the extension, in any case, determines the format.
 
-    No vertex is merged, moved, reordered or dropped. STL is the exception, as it stores no shared
-    vertices: corners at equal coordinates become one vertex, numbered by first appearance. So is a
-    scene of several meshes, or of one that joints or morph targets move, which is read in its rest
-    pose and joined at its seams. Polygons are cut into triangles, see `triangulate`, and
-    `Mesh.notes` says so.
+    No vertex is merged, moved, reordered or dropped, with two exceptions. STL stores no shared
+    vertices: corners at equal coordinates become one vertex, numbered by first appearance. A scene
+    of several meshes, or of one that joints or morph targets move, is read in its rest pose and
+    joined at its seams. Polygons are triangulated (see `triangulate`), with a note in
+    `Mesh.notes`.
 
     Parameters
     ----------
     path : an .obj, .ply, .off, .stl, .glb, .gltf, .vrm or .fbx file
-    topology : the connectivity that the mesh is expected to have, as that of its set or model.
-        Polygons are cut as it was cut from them. When the triangles of an STL file, or of a glTF
-        file of other vertices, fit, they are put back into this vertex order. A mesh with the same
-        faces shares the object.
+    topology : the expected connectivity, such as that of its set or model. Polygons are
+        triangulated as in it. The triangles of an STL file, or of a glTF file with other vertices,
+        are put into its vertex order if they match. A mesh with the same faces shares the object.
 
     Returns
     -------
@@ -174,9 +172,9 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
 
     Raises
     ------
-    MeshFileError : the file is missing, empty, truncated, damaged or no mesh, holds more than
-        `MAX_FACES` faces or vertices, a coordinate is not finite, or a face names a vertex that
-        does not exist. The sentence names the file and the element.
+    MeshFileError : the file is missing, empty, truncated, damaged or not a mesh, holds more than
+        `MAX_FACES` faces or vertices, a coordinate is not finite, or a face uses a vertex that
+        does not exist. The message names the file and the element.
     """
     source = Path(path)
     with as_file_error(path):
@@ -196,7 +194,7 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
 
 
 def coarseness_of(vertices: npt.NDArray[Any], topology: Topology) -> str | None:
-    """Say what a mesh has lost by being stored in float32 where it lies; None if nothing."""
+    """Describe the precision that a mesh lost by being stored in float32; None if it is enough."""
     if can_hold(vertices, topology, np.float32):
         return None
     step, ratio = rounding_step(vertices, topology, np.float32)
@@ -223,12 +221,12 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
 
 
 def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:
-    """Return the rest pose of a scene, in the vertex order of a topology where that fits."""
+    """Return the rest pose of a scene, in the vertex order of `topology` if that matches."""
     part = scene.parts[0]
     is_plain = len(scene.parts) == len(part.bones) == 1 and not part.is_skinned
     is_plain = is_plain and not part.morphs.size
     notes: tuple[str, ...] = ()
-    # A node may move float32 vertices far away, where the product keeps their digits.
+    # A node may move float32 vertices far away; the float64 product keeps their precision.
     is_single = False
     if is_plain:
         vertices, faces, notes = part.points, part.faces, scene.notes
@@ -236,7 +234,7 @@ def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:
         transform = scene.rest.transforms[0, part.node] @ part.bind[0]
         is_single = part.is_single and np.array_equal(transform, np.eye(4))
         if not is_single:
-            # A coordinate that is not finite is refused with all others.
+            # Coordinates that are not finite are refused later.
             with np.errstate(all="ignore"):
                 vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
     else:
@@ -268,9 +266,9 @@ def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int
 
 
 def first_not_finite(vertices: npt.NDArray[Any], largest: float = np.inf) -> int | None:
-    """Return the first vertex of (V, 3) `vertices` with a NaN or an infinity, if there is one.
+    """Return the first of (V, 3) vertices with a NaN or infinite coordinate, None if there is none.
 
-    Where `largest` is given, coordinates beyond it count as infinite.
+    Coordinates beyond `largest` count as infinite.
     """
     finite = np.isfinite(vertices) & (np.abs(vertices) <= np.float64(largest))
     if finite.all():
@@ -286,26 +284,26 @@ def write_mesh(
     up: FloatArray | None = None,
     detail: ObjDetail | None = None,
 ) -> None:
-    """Write one triangle mesh whole or not at all; the extension, in any case, says the format.
+    """Write one triangle mesh atomically; the extension, in any case, determines the format.
 
     OBJ and OFF are written with the shortest decimals that read back as the same numbers, PLY in
-    binary with the precision of `vertices`; STL and GLB keep float32 by their nature.
+    binary with the precision of `vertices`; STL and GLB only store float32.
 
     Parameters
     ----------
     path : an .obj, .ply, .off, .stl or .glb file in an existing folder
     vertices : (V, 3) array; float32 is written as such, anything else as float64
     faces : (F, 3) integer array, indices from 0
-    up : (3,) direction that is upwards, if it is known: formats that say what theirs is, as glTF
-        does, get the mesh turned by the right angles that bring the axis next to it there
-    detail : what an OBJ file holds beside the corners of its faces; other formats leave it out
+    up : (3,) up direction, if known: for a format with a fixed up axis, such as glTF, the mesh is
+        turned by right angles so that the axis nearest to it becomes that one
+    detail : further content of an OBJ file; other formats ignore it
 
     Raises
     ------
-    ShapeError : an array has another shape, or a vertex is not finite.
-    PoseSetError : a face names a vertex that does not exist.
-    MeshFileError : the extension is unknown, the file cannot be written, or so far from the origin
-        the format cannot hold the mesh: see `as_stored`.
+    ShapeError : an array has the wrong shape, or a vertex is not finite.
+    PoseSetError : a face uses a vertex that does not exist.
+    MeshFileError : the extension is unknown, the file cannot be written, or the mesh is too far
+        from the origin for the format: see `as_stored`.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in WRITABLE_SUFFIXES:
@@ -338,12 +336,12 @@ def write_mesh(
 
 
 def turn_to_y(up: FloatArray) -> FloatArray:
-    """Return the rotation by right angles that brings the axis next to a direction to +y."""
+    """Return the rotation by right angles that takes the axis nearest to a direction to +y."""
     axis = int(np.abs(up).argmax())
     towards = np.eye(3)[axis] * np.sign(up[axis])
     y = np.array([0.0, 1.0, 0.0])
     if axis == 1:
-        # Upside down: about x.
+        # If upside down, turn about x.
         return np.eye(3) if up[1] > 0.0 else np.diag([1.0, -1.0, -1.0])
     aside = np.cross(towards, y)
     turn: FloatArray = np.outer(y, towards) - np.outer(towards, y) + np.outer(aside, aside)

@@ -1,4 +1,4 @@
-"""File names: extensions, and valid file names made from the names of poses."""
+"""Extensions of files, and valid file names made from names of poses."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def numbered_where_equal(
     key: Callable[[str], str] = str,
     joined: Callable[[str, str], str] = str.__add__,
 ) -> list[str]:
-    """Return names of which no two have the same key: a later one gets a number, " 2", behind it.
+    """Make names unique by key: append a number such as " 2" to later ones.
 
     Parameters
     ----------
-    names : any
-    key : from a name to what must differ, such as the name in small letters
-    joined : puts an ending behind a name, which may have to be shortened for that
+    names : any names
+    key : maps a name to the value that must be unique, such as the name in lower case
+    joined : appends an ending to a name, and may shorten the name for it
     """
     taken: set[str] = set()
     counts: Counter[str] = Counter()
@@ -40,7 +40,7 @@ def numbered_where_equal(
 
 
 MAX_STEM_BYTES = 130
-"""Most bytes of a name without its extension; file systems allow 143 to 255 in all."""
+"""Most bytes of a name without its extension; file systems allow 143 to 255 in total."""
 
 _OF_OTHER_PROGRAMS = re.compile(
     r"\.(3dm|3ds|3mf|7z|abc|blend|bz2|c4d|dae|docx?|dxf|gz|iges|igs|ini|jsonl|log|lwo|ma|max"
@@ -48,7 +48,7 @@ _OF_OTHER_PROGRAMS = re.compile(
     r"|vrml|vtk|vtp|vtu|wrl|x3d|xlsx|xyz|xz|ya?ml|zip|zst|ztl)"
 )
 _MEDIA = MimeTypes()
-"""The extensions that the standard library knows, whatever the machine's own lists say."""
+"""Extensions known to the standard library, independent of the machine's own lists."""
 
 _NOT_IN_NAMES = re.compile(r'[\x00-\x1f\x7f-\x9f\u2028\u2029<>:"/\\|?*]+')
 _RESERVED = re.compile(r"(CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9¹²³])\s*(\.|$)", re.I)
@@ -56,7 +56,7 @@ _RESERVED = re.compile(r"(CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9¹²³])
 
 
 def has_known_suffix(path: PurePath) -> bool:
-    """Whether a name ends in the extension of some kind of file; ".9" in "walk_v0.9" is none."""
+    """Whether a name ends in the extension of a known format, unlike ".9" in "walk_v0.9"."""
     suffix = path.suffix.lower()
     if suffix in FILES or suffix in _MEDIA.types_map[True]:
         return True
@@ -64,13 +64,13 @@ def has_known_suffix(path: PurePath) -> bool:
 
 
 def file_stem(name: str) -> str:
-    """Return a name made valid for a file, without extension, on common file systems."""
+    """Make a name valid as a file name without extension on common file systems."""
     stem = _cut(_NOT_IN_NAMES.sub("_", name), MAX_STEM_BYTES) or "pose"
     return f"_{_cut(stem, MAX_STEM_BYTES - 1)}" if _RESERVED.match(stem) else stem
 
 
 def file_stems(names: Iterable[str]) -> list[str]:
-    """Return each name's `file_stem`, numbered where an earlier one is the same file: "a", "A 2".
+    """Return each name's `file_stem`, numbered if an earlier one is the same file: "a", "A 2".
 
     Some file systems ignore case and the encoding of accents.
     """

@@ -1,4 +1,4 @@
-"""Pose sets, many poses of one body, of meshes that share their faces: read, thinned, written."""
+"""Pose sets, poses of one body as meshes that share their faces: read, thin and write them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _MAX_PROVENANCE_LENGTH = 2_000_000
 
 
 def rules_to_arrays(rules: ContactRules) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of some rules: "near_exclusion", and "rules" where there are others."""
+    """Encode rules as arrays: "near_exclusion", and "rules" if there are others."""
     arrays: dict[str, npt.NDArray[Any]] = {"near_exclusion": np.array(rules.near_exclusion)}
     if rules != ContactRules(rules.near_exclusion):
         arrays["rules"] = np.array(json.dumps(rules.to_json()))
@@ -63,12 +63,12 @@ def rules_to_arrays(rules: ContactRules) -> dict[str, npt.NDArray[Any]]:
 
 
 def rules_from_arrays(arrays: Arrays, near_exclusion: float) -> ContactRules:
-    """Return the rules of a file, of which older ones have the near exclusion only.
+    """Decode the rules of a file; older files have the near exclusion only.
 
     Raises
     ------
     MeshFileError : they are damaged.
-    ShapeError : the near exclusion is not a length.
+    ShapeError : the near exclusion is invalid.
     """
     stored = arrays.get("rules")
     if stored is None:
@@ -84,7 +84,7 @@ def rules_from_arrays(arrays: Arrays, near_exclusion: float) -> ContactRules:
 
 
 def groups_to_arrays(groups: Sequence[FaceGroup]) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of groups: their names, and their runs of faces one after the other."""
+    """Encode groups as arrays: their names, and their concatenated runs of faces."""
     if not groups:
         return {}
     runs = [faces_to_runs(group.faces) for group in groups]
@@ -97,7 +97,7 @@ def groups_to_arrays(groups: Sequence[FaceGroup]) -> dict[str, npt.NDArray[Any]]
 
 
 def groups_from_arrays(arrays: Arrays, n_faces: int) -> tuple[FaceGroup, ...]:
-    """Return the groups of a file whose mesh has so many faces.
+    """Decode the groups of a file whose mesh has `n_faces` faces.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def groups_from_arrays(arrays: Arrays, n_faces: int) -> tuple[FaceGroup, ...]:
 
 
 def texts_of(value: npt.NDArray[np.str_], name: str, most: int) -> tuple[str, ...]:
-    """Return the texts of an array, cut to a length, that can be printed.
+    """Return the strings of an array, cut to `most` characters and made printable.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def texts_of(value: npt.NDArray[np.str_], name: str, most: int) -> tuple[str, ..
 
 
 def provenance_from_arrays(arrays: Arrays) -> dict[str, Any]:
-    """Return how the poses of a file were made, JSON values by name; empty where it does not say.
+    """Return the provenance of a file's poses, JSON values by name; empty if there is none.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def provenance_from_arrays(arrays: Arrays) -> dict[str, Any]:
 
 
 FORMAT_VERSION = 2
-"""The latest version that is read; sets without joints or touching patches are of version 1."""
+"""The latest version that is read; sets that need none of its rules are written as version 1."""
 
 _MESH_ARRAYS = (("vertices", "V"), ("faces", "F"))
 _EXTRA_ARRAYS = (
@@ -181,7 +181,7 @@ _EXTRA_ARRAYS = (
 _MAX_TEXT_LENGTH = 500
 
 _LARGEST_COORDINATE = 1e150
-"""Largest coordinate; its square is finite."""
+"""Largest coordinate, whose square is finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,19 +193,20 @@ class PoseSet:
     vertices : (N, V, 3) float32 or float64 array, read-only, in the files' unit; pose 0 is the
         reference
     topology : the faces that all poses share
-    names : N names, the mesh files' or "pose 12"
-    source : the folder or file that it was read from, if it was
+    names : N names, of the mesh files or such as "pose 12"
+    source : the folder or file that it was read from, if any
     notes : sentences on changes made on reading
-    rules : which pairs of faces do not count
-    groups : named groups of faces, of which the rules may ignore pairs
-    up_axis : 0, 1 or 2 for x, y or z; None if it is to be guessed
+    rules : contact rules
+    groups : named groups of faces, which the rules may refer to
+    up_axis : 0, 1 or 2 for x, y or z; None to guess it
     vertex_labels : (V,) array of printable strings, the body part of each vertex, if known
-    provenance : how the poses were made, JSON values by name
-    metres : length of the vertices' unit, None if it is unknown
+    provenance : how the poses were made, as JSON values by name
+    metres : length of the vertices' unit, None if unknown
 
     Raises
     ------
-    ShapeError : the arrays do not fit together, or a vertex's label is blank or not printable.
+    ShapeError : the arrays do not match, a value is out of range, or a vertex's label is blank or
+        not printable.
     """
 
     vertices: npt.NDArray[Any]
@@ -257,7 +258,7 @@ class PoseSet:
 
         Raises
         ------
-        ShapeError : the factor is no number above 0, or a coordinate would overflow.
+        ShapeError : the factor is not a number above 0, or a coordinate would overflow.
         """
         if not 0.0 < factor < np.inf:
             raise ShapeError.must_be("the scale", "a number above 0", f"{factor:g}")
@@ -269,12 +270,12 @@ class PoseSet:
 
     @property
     def near_exclusion(self) -> float:
-        """Normalised length along the surface up to which pairs are near, and do not count."""
+        """Normalised length along the surface within which pairs do not count."""
         return self.rules.near_exclusion
 
     @property
     def up(self) -> UpGuess:
-        """The up axis: as stored in the set, else guessed from its poses."""
+        """The up axis stored in the set, else a guess from its poses."""
         if self.up_axis is not None:
             return UpGuess(self.up_axis, True, "the set says so")
         return guess_up(self.topology, self.vertices)
@@ -286,20 +287,20 @@ class PoseSet:
 
 
 def natural_key(path: Path) -> tuple[list[str | int], str]:
-    """Return a sorting key under which mesh2.obj comes before mesh10.obj, in any case."""
+    """Return a sort key that puts mesh2.obj before mesh10.obj, ignoring case."""
     parts = re.split(r"([0-9]+)", path.stem.casefold())
-    # Every second part is digits, so numbers are compared with numbers and text with text.
+    # Every second part is digits, so numbers are only compared with numbers.
     return [int(part) if index % 2 else part for index, part in enumerate(parts)], path.name
 
 
 def mesh_files(folder: Path) -> tuple[list[Path], list[str]]:
-    """Return the mesh files of a folder in natural order, and the names of what else it holds.
+    """Return the mesh files of a folder in natural order, and the names of its other entries.
 
-    Hidden files do not count.
+    Hidden files are ignored.
 
     Raises
     ------
-    MeshFileError : it cannot be listed.
+    MeshFileError : the folder cannot be listed.
     """
     try:
         entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
@@ -318,28 +319,28 @@ def read_pose_set(
     fps: float | None = None,
     topology: Topology | None = None,
 ) -> PoseSet:
-    """Read a pose set and refuse it at the first defect.
+    """Read a pose set, and refuse it at the first defect.
 
     Parameters
     ----------
     path : a folder of mesh files of one format, read in natural order; an .npz file with
         `vertices` (N, V, 3) and `faces` (F, 3), also called `V` and `F`; a .glb, .gltf, .vrm or
-        .fbx file with animations, of which pose 0 is the rest pose; or a .pc2 or .mdd file with
-        its mesh beside it, which is pose 0
-    job : reports (poses done, poses in all); polled between poses
-    clip : the animation of a file that has several; None for all
-    fps : frames a second of an animation; None for its keys, at most 30 a second
-    topology : of another set of the same body, as which polygons are cut
+        .fbx file with animations, whose rest pose becomes pose 0; or a .pc2 or .mdd file with its
+        mesh beside it, which becomes pose 0
+    job : reports (poses done, all poses); polled between poses
+    clip : name of one animation of a file; None for all
+    fps : frames per second of an animation; None for its keys, at most 30 per second
+    topology : topology of another set of the same body, whose triangulation of polygons is used
 
     Returns
     -------
-    the pose set; its vertices are float64, but an .npz file's keep their precision
+    the pose set; its vertices are float64, except that an .npz file's keep their precision
 
     Raises
     ------
     MeshFileError : the folder or a file cannot be read.
     PoseSetError : a pose has another vertex count or other faces than the first, another size or
-        order of vertices than most, or a triangle of the first has no area.
+        vertex order than most, or a triangle of the first has no area.
     CancelledError : the job was cancelled.
     """
 
@@ -354,11 +355,11 @@ def read_pose_set(
 
 
 def require_usable_reference(poses: PoseSet) -> None:
-    """Refuse a set of which a face of the reference has no area.
+    """Refuse a set whose reference has a face without area.
 
     Raises
     ------
-    PoseSetError : the sentence names the set's source.
+    PoseSetError : the message names the set's source.
     """
     flat = degenerate_faces(poses.topology, poses.vertices[0])
     if len(flat):
@@ -378,11 +379,11 @@ class PoseSetInspection:
 
     Attributes
     ----------
-    pose_set : the poses that agree with the first readable one; None if none can be used
-    n_found : the poses that are there, usable or not
+    pose_set : the poses that match the first readable one; None if none can be used
+    n_found : number of poses present, usable or not
     same_topology : whether all readable poses share their vertex count and faces
-    defects : of the set and its poses, in the order found
-    problems : a sentence for each defect, those of the reference, pose 0, among them
+    defects : defects of the set and its poses, in the order found
+    problems : a sentence for each defect, including those of the reference, pose 0
     """
 
     pose_set: PoseSet | None
@@ -400,13 +401,13 @@ def collect_poses(
     fps: float | None = None,
     topology: Topology | None = None,
 ) -> PoseSetInspection:
-    """Read all poses that fit together and report each defect.
+    """Read all poses that match the first, and report each defect.
 
     Parameters
     ----------
-    path : as for `read_pose_set`
-    report : called with each defect; when it raises, reading ends there
-    job, clip, fps, topology : as for `read_pose_set`
+    path : see `read_pose_set`
+    report : called with each defect; raise in it to stop reading
+    job, clip, fps, topology : see `read_pose_set`
     """
     try:
         is_folder, exists = path.is_dir(), path.exists()
@@ -434,7 +435,7 @@ def collect_poses(
 
 
 def _too_far_to_compute(where: str, vertices: npt.NDArray[Any]) -> PoseSetError | None:
-    """Say which of a pose's (V, 3) vertices is not finite, or too far out to be squared."""
+    """Return the error for a vertex of a pose that is not finite or too far out, if any."""
     vertex = first_not_finite(vertices, _LARGEST_COORDINATE)
     if vertex is None:
         return None
@@ -448,7 +449,7 @@ def _too_far_to_compute(where: str, vertices: npt.NDArray[Any]) -> PoseSetError 
 def _without_outliers(
     collected: PoseSetInspection, report: Callable[[LCollisionError], None]
 ) -> PoseSetInspection:
-    """Leave out the poses that are another body, or the same in another unit."""
+    """Leave out poses of another body or in another unit."""
     poses = collected.pose_set
     outliers = {} if poses is None else outlier_poses(poses.topology, poses.vertices)
     if poses is None or not outliers:
@@ -460,7 +461,7 @@ def _without_outliers(
 
 
 def _only(poses: PoseSet, kept: list[int]) -> PoseSet | None:
-    """Return some poses of a set, or None if there are none."""
+    """Return the kept poses of a set, or None if there are none."""
     if len(kept) in (0, len(poses)):
         return poses if kept else None
     names = tuple(poses.names[pose] for pose in kept)
@@ -527,7 +528,7 @@ def _collect_folder(
     ]
     if others:
         sentences.append(f"{len(others)} other entries were ignored: {', '.join(others[:5])}")
-    # y is up in glTF, by its standard.
+    # The glTF standard defines y as up.
     up_axis = 1 if formats.keys() <= set(GLTF_SUFFIXES) else None
     pose_set = PoseSet(
         vertices[: len(names)], topology, tuple(names), path, tuple(sentences), up_axis=up_axis
@@ -536,7 +537,7 @@ def _collect_folder(
 
 
 def disagreement(where: str, found: Topology, expected: Topology) -> PoseSetError | None:
-    """Say where the topology of a mesh, named by `where`, is not that of its set."""
+    """Return the error for a mesh whose topology differs from its set's, None if it is equal."""
     if found.n_vertices != expected.n_vertices:
         what, needed, got = "number of vertices", expected.n_vertices, found.n_vertices
     elif found.n_faces != expected.n_faces:
@@ -652,7 +653,7 @@ def _meshes_of(
 
 
 def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> dict[str, Any]:
-    """Return the arguments of `PoseSet` that are held beside (N, V, 3) vertices."""
+    """Return the optional arguments of `PoseSet` from the arrays beside (N, V, 3) vertices."""
     extras: dict[str, Any] = {}
     for name, kinds, needed in (
         ("format_version", "iu", ()),
@@ -691,12 +692,12 @@ def _require_labels(vertex_labels: npt.NDArray[np.str_]) -> None:
 
 
 def write_pose_set(path: str | os.PathLike[str], pose_set: PoseSet) -> None:
-    """Write a pose set as .npz, whole or not at all; equal sets give equal bytes.
+    """Write a pose set as .npz atomically; equal sets give equal bytes.
 
     Parameters
     ----------
     path : an .npz file in an existing folder
-    pose_set : what to write; its `source` is not kept
+    pose_set : the pose set; its `source` is not stored
 
     Raises
     ------
@@ -729,19 +730,19 @@ def write_pose_set(path: str | os.PathLike[str], pose_set: PoseSet) -> None:
 
 
 def concatenated(pose_sets: Sequence[PoseSet]) -> PoseSet:
-    """Return the poses of several sets, of which the first has the reference.
+    """Concatenate the poses of several sets; the first one has the reference.
 
-    The reference of a later set is left out where it is the first one's. What else a set has is
-    taken from the first; names get their file's before them if there are several. Where a set has
-    a provenance, that of the result lists all `sources`.
+    The reference of a later set is left out if it equals the first one's. Everything but poses and
+    notes is taken from the first set; names are prefixed by their file's if there are several. If
+    a set has a provenance, that of the result lists all `sources`.
 
     Parameters
     ----------
-    pose_sets : one or more of one topology
+    pose_sets : one or more sets of the same topology
 
     Raises
     ------
-    PoseSetError : the topology differs, or there are too many coordinates.
+    PoseSetError : the topologies differ, or there are too many coordinates.
     """
     first = pose_sets[0]
     if len(pose_sets) == 1:
@@ -773,7 +774,7 @@ def concatenated(pose_sets: Sequence[PoseSet]) -> PoseSet:
 
 
 def _provenance(pose_sets: Sequence[PoseSet], counts: Sequence[int]) -> dict[str, Any]:
-    """Say which file each part of the poses is of, where one of them says how it was made."""
+    """Return the sources of the poses in order, if any set has a provenance."""
     if not any(poses.provenance for poses in pose_sets):
         return {}
     parts: list[dict[str, Any]] = []
@@ -788,30 +789,30 @@ def _provenance(pose_sets: Sequence[PoseSet], counts: Sequence[int]) -> dict[str
 
 
 TOLERANCE = 0.005
-"""Of the body size: what a latent space reconstructs no better than. All 71 SCAPE poses are kept,
-145 of the 150 frames of the published jump, and 89 of the mannequin's clip and rest pose; with 0.01
-it would be 71, 137 and 47, but a head that turns by 35 degrees alone moves the mannequin by 0.0065
-and one hand that closes by 0.011."""
+"""In body sizes, about the reconstruction error of a latent space. It keeps all 71 SCAPE poses, 145
+of the 150 frames of the published jump, and 89 of the mannequin's clip and rest pose. With 0.01 it
+would be 71, 137 and 47, but turning only the head by 35 degrees moves the mannequin by 0.0065, and
+closing one hand by 0.011."""
 
 _VERTICES = 500
-"""By which poses are compared, evenly spaced among all."""
+"""Number of vertices by which poses are compared, evenly spaced among all."""
 
 
 def thinned(poses: PoseSet, tolerance: float = TOLERANCE, job: Job = UNWATCHED) -> PoseSet:
-    """Leave out poses that are another one's near-duplicates, wherever they lie.
+    """Leave out near-duplicates of poses, up to rigid motion.
 
-    Two are when the root mean square distance of their vertices, one moved rigidly onto the other,
-    is below the tolerance. Of near-duplicates the first is kept, and so is pose 0.
+    Two poses are near-duplicates if the root mean square distance of their vertices, after rigid
+    alignment, is below the tolerance. The first of them is kept, so pose 0 always is.
 
     Parameters
     ----------
     poses : the set
-    tolerance : as a fraction of the body size
+    tolerance : in body sizes
     job : polled between poses
 
     Returns
     -------
-    poses : those that are kept, in their order; a note says how many are left out
+    poses : the remaining poses in order, with a note on how many were left out
 
     Raises
     ------
@@ -837,8 +838,8 @@ def _kept(poses: PoseSet, tolerance: float, job: Job) -> list[int]:
     size = body_size(poses.vertices[0], poses.topology)
     points = poses.vertices[:, chosen].astype(np.float64) / size
     points -= points.mean(axis=1, keepdims=True)
-    # No motion changes the distance of two vertices, and where they move by a and b it changes by
-    # at most a + b, so that half the squared changes of disjoint pairs are a lower bound.
+    # A rigid motion keeps the distance of two vertices, and moving them by a and b changes it by at
+    # most a + b, so half the sum of squared changes of disjoint pairs is a lower bound.
     half = len(chosen) // 2
     spans = np.linalg.norm(points[:, :half] - points[:, half : 2 * half], axis=2)
     kept: list[int] = []
@@ -852,10 +853,10 @@ def _kept(poses: PoseSet, tolerance: float, job: Job) -> list[int]:
 
 
 def _squared_distances(poses: FloatArray, vertices: FloatArray) -> FloatArray:
-    """Return mean squared distances of (K, n, 3) poses turned onto (n, 3) vertices; all centred.
+    """Return mean squared distances of (K, n, 3) poses rotated onto (n, 3) vertices; all centred.
 
-    The best rotation turns the trace of the covariance into the sum of its singular values, the
-    last one negative where a reflection would do better (Kabsch 1976).
+    With the best rotation, the trace of the covariance is the sum of its singular values, the last
+    one negative if a reflection would fit better (Kabsch 1976).
     """
     covariance = np.einsum("ni,knj->kij", vertices, poses, optimize=True)
     values = np.linalg.svd(covariance, compute_uv=False)

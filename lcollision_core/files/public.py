@@ -1,4 +1,4 @@
-"""What `lcollision_core.files` offers, and loads once something of it is asked for."""
+"""The public names of `lcollision_core.files`, loaded on first use."""
 
 from lcollision_core.files.audit import audit_mesh, inspect_pose_set
 from lcollision_core.files.character import Character, ClipFrames, Rig

@@ -1,4 +1,4 @@
-"""Files read and written with care: regular ones, whole or not at all, by one writer at a time."""
+"""Safe file access: regular files only, atomic writes, locks, and untrusted .npz archives."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ _KINDS = (
 
 
 def require_regular(path: str | os.PathLike[str]) -> int:
-    """Return the size in bytes of a file that may be opened, of whatever name.
+    """Return the size in bytes of a regular file, and refuse anything else.
 
-    Opening a pipe waits for its writer, a device may never end, and the error of a
-    folder explains nothing; so none of them is opened.
+    Opening a pipe waits for its writer, a device may never end, and the error for a folder is
+    unclear, so none of them is opened.
 
     Raises
     ------
-    OSError : there is no such file, or it is something else; `strerror` says what.
-    ValueError : the name holds a NUL byte.
+    OSError : there is no such file, or it is not a regular file; `strerror` says what it is.
+    ValueError : the name contains a NUL byte.
     """
     status = Path(path).stat()
     if stat.S_ISREG(status.st_mode):
@@ -49,22 +49,22 @@ def require_regular(path: str | os.PathLike[str]) -> int:
 
 
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
-    """Open a regular file to read its bytes.
+    """Open a regular file for binary reading.
 
     Raises
     ------
-    OSError, ValueError : as for `require_regular`, or it may not be read.
+    OSError, ValueError : see `require_regular`, or reading is not permitted.
     """
     require_regular(path)
     return Path(path).open("rb")
 
 
 def read_regular(path: str | os.PathLike[str], most_bytes: int) -> bytes:
-    """Read a regular file whole.
+    """Read a whole regular file.
 
     Raises
     ------
-    OSError, ValueError : as for `open_regular`, or it has more than `most_bytes` bytes.
+    OSError, ValueError : see `open_regular`, or it has more than `most_bytes` bytes.
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -76,19 +76,19 @@ def read_regular(path: str | os.PathLike[str], most_bytes: int) -> bytes:
 
 
 _LOCKED_BYTE = 1 << 30
-"""Far beyond the file's end, as Windows prevents others from reading locked bytes."""
+"""Far beyond the end of the file, as Windows prevents others from reading locked bytes."""
 _SECONDS_BETWEEN_TRIES = 0.05
 _MAX_LOCK_NAME_BYTES = 200
 
 
 @contextmanager
 def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
-    """Hold a file's lock, so that no other holder changes the file meanwhile.
+    """Lock a file against changes by other threads and processes.
 
-    Reading, changing and writing back a file inside the block loses no other change, in this
-    process or another: ``with locked(path): write(change(read(path)))``. The lock is on a hidden
-    file beside `path`, which is removed at the end; after a kill it is free, and the next holder
-    removes it. A thread that holds the lock must not ask for it again.
+    Inside the block, a file can be read, changed and written without losing another's change:
+    ``with locked(path): write(change(read(path)))``. The lock is on a hidden file beside `path`,
+    which is removed at the end; if the process is killed, the lock is released and the next holder
+    removes the file. The lock is not re-entrant.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
 
     Raises
     ------
-    HeldElsewhereError : another holds it for longer.
+    HeldElsewhereError : another holder has not released the lock in time.
     MeshFileError : the folder is missing, read-only or on a disk without locks.
     """
     target = Path(os.path.realpath(path))
@@ -114,7 +114,7 @@ def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
     try:
         yield
     finally:
-        if sys.platform == "win32":  # where nothing that is open can be removed
+        if sys.platform == "win32":  # where open files cannot be removed
             file.close()
         with suppress(OSError):
             lock.unlink()
@@ -122,7 +122,7 @@ def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
 
 
 def _lock(file: BinaryIO) -> None:
-    """Lock an open file for as long as it stays open; OSError says that another has it."""
+    """Lock an open file until it is closed; raise OSError if it is locked elsewhere."""
     if sys.platform == "win32":
         import msvcrt
 
@@ -135,16 +135,16 @@ def _lock(file: BinaryIO) -> None:
 
 
 def shortened(name: str, n_bytes: int) -> str:
-    """Cut a file name to `n_bytes` bytes, which is what file systems count, between characters."""
+    """Cut a file name between characters to `n_bytes` bytes, which is what file systems count."""
     while len(os.fsencode(name)) > n_bytes:
         name = name[:-1]
     return name
 
 
 def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
-    """Open and lock the lock's file, or return None where another holds it."""
+    """Open and lock the lock file; return None if another holder has it."""
     try:
-        # Opening a pipe would wait for its reader for ever; another holder removes the lock's file.
+        # Opening a pipe would wait for its reader for ever. The file may be missing.
         with suppress(FileNotFoundError):
             require_regular(lock)
         file = lock.open("ab", buffering=0)
@@ -154,7 +154,7 @@ def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
         ) from error
     try:
         _lock(file)
-        # Its last holder may have removed it, and a lock on a removed file excludes no one.
+        # Its last holder may have removed it, and a lock on a removed file excludes nobody.
         if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
             return file
     except (BlockingIOError, PermissionError, FileNotFoundError):
@@ -169,9 +169,9 @@ def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
 
 
 _MAX_NAME_BYTES = 100
-"""Most bytes of a temporary name without its marks."""
+"""Most bytes of the target's name within a temporary name."""
 _MAX_STEM_BYTES = 200
-"""Most bytes of an unused name, so that the number fits."""
+"""Most bytes of the stem of an unused name, to leave space for a number."""
 
 FileStamp = tuple[int, int, int, int]
 """Changes whenever a file is replaced or written to."""
@@ -182,9 +182,9 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a file for writing that takes its name only once it is complete and on disk.
 
     The bytes go to a hidden file beside `path`, which is flushed, fsynced and renamed when the
-    block ends. When the block raises, the hidden file is removed and an older `path` stays as it
-    was; only a killed process leaves it. A symbolic link keeps pointing where it did; the file that
-    it names is replaced.
+    block ends. If the block raises, the hidden file is removed and an existing `path` is unchanged;
+    only a killed process leaves the hidden file. If `path` is a symbolic link, the file that it
+    points to is replaced.
 
     Parameters
     ----------
@@ -219,14 +219,14 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 @contextmanager
 def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a folder for files that move into `folder` together, once all are complete.
+    """Yield a folder for files that move into `folder` together once all are complete.
 
-    Files of the same names are replaced, others stay. When the block raises, nothing comes, and a
-    `folder` that was not there before is none again.
+    Files of the same names are replaced, others stay. If the block raises, no file is moved, and
+    `folder` is removed if it is new.
 
     Parameters
     ----------
-    folder : made if there is none; its parent must exist
+    folder : created if missing; its parent must exist
 
     Yields
     ------
@@ -234,7 +234,7 @@ def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
 
     Raises
     ------
-    MeshFileError : `folder` cannot be made or written to.
+    MeshFileError : `folder` cannot be created or written to.
     """
     target = Path(folder)
     is_new = not os.path.lexists(target)
@@ -257,7 +257,7 @@ def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
         ) from error
     finally:
         if is_new:
-            with suppress(OSError):  # it is not empty, as it should be
+            with suppress(OSError):  # after a success it is not empty
                 target.rmdir()
 
 
@@ -270,7 +270,7 @@ def _move_all(folder: Path, target: Path) -> None:
         for name in names:
             (folder / name).replace(os.path.realpath(target / name))
     except KeyboardInterrupt:
-        # Half of it would be neither the old content nor the new.
+        # Move the rest: half of the files would be neither the old content nor the new.
         _move_all(folder, target)
         raise
 
@@ -278,7 +278,7 @@ def _move_all(folder: Path, target: Path) -> None:
 def file_stamp(path: str | os.PathLike[str]) -> FileStamp | None:
     """Return a stamp that changes when a file is replaced; None if there is no file.
 
-    Compared inside `locked`, it says whether the file is still the one that was read.
+    Compare stamps inside `locked` to find out whether the file is still the one that was read.
     """
     try:
         status = Path(path).stat()
@@ -288,7 +288,7 @@ def file_stamp(path: str | os.PathLike[str]) -> FileStamp | None:
 
 
 def unused_name(path: Path) -> Path:
-    """Return a name beside `path` that no file has: "m 2.obj"."""
+    """Return an unused name beside `path`, such as "m 2.obj"."""
     stem, number = shortened(path.stem, _MAX_STEM_BYTES), 2
     while (unused := path.with_name(f"{stem} {number}{path.suffix}")).exists():
         number += 1
@@ -296,11 +296,11 @@ def unused_name(path: Path) -> Path:
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:
-    """Refuse a path that `atomic_write` could not write, before long work is done for it.
+    """Refuse a path that `atomic_write` could not write, to call before long work.
 
     Raises
     ------
-    MeshFileError : as for `atomic_write`.
+    MeshFileError : see `atomic_write`.
     """
     folder = _plain_file_in_a_folder(path).parent
     if not os.access(folder, os.W_OK | os.X_OK):
@@ -310,7 +310,7 @@ def require_writable(path: str | os.PathLike[str]) -> None:
 def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:
     target = Path(os.path.realpath(path))
     try:
-        # Renaming over a device such as /dev/null would replace it by a plain file.
+        # Renaming over a device such as /dev/null would replace it with a regular file.
         with suppress(FileNotFoundError, NotADirectoryError):
             require_regular(target)
     except OSError as error:
@@ -323,7 +323,7 @@ def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:
 
 
 MAX_ITEMS = 1_000_000_000
-"""The most numbers that one array may hold: 8 GB of float64."""
+"""Most numbers in one array: 8 GB of float64."""
 
 ZIP_DAMAGE = (
     zipfile.BadZipFile,
@@ -333,7 +333,7 @@ ZIP_DAMAGE = (
     NotImplementedError,  # a compression method that zipfile lacks
     RuntimeError,  # an encrypted entry
     ValueError,  # UnicodeDecodeError too
-    TypeError,  # numpy's error for an unknown type
+    TypeError,  # NumPy's error for an unknown type
     OverflowError,
 )
 
@@ -352,24 +352,25 @@ _CHUNK_BYTES = 1 << 24
 def read_npz(
     path: Path, wanted: Iterable[Sequence[str]]
 ) -> tuple[dict[str, npt.NDArray[Any]], tuple[str, ...]]:
-    """Read some arrays of an .npz archive; a wanted one of Python objects is refused.
+    """Read some arrays of an .npz archive; arrays of Python objects are refused.
 
-    Other arrays take no memory.
+    Other arrays are not read.
 
     Parameters
     ----------
     path : the archive
-    wanted : for each array its names; the first one found counts
+    wanted : alternative names of each array; the first one present is read
 
     Returns
     -------
-    arrays : those that are wanted and there, by the first of their names
-    names : of all arrays in the archive
+    arrays : the wanted arrays that are present, by the first of their names
+    names : names of all arrays in the archive
 
     Raises
     ------
-    MeshFileError : the file is missing, damaged or no archive of arrays, or a wanted array is
-        larger than `MAX_ITEMS` or than the file can hold. The sentence does not name the file.
+    MeshFileError : the file is missing, damaged or not an archive of arrays, or a wanted array has
+        Python objects or is larger than `MAX_ITEMS` or than the file can hold. The message does
+        not name the file.
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
@@ -401,7 +402,7 @@ def read_npz(
 def _read_array(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> npt.NDArray[Any]:
     with archive.open(info) as file:
         dtype, in_fortran_order, shape = _read_header(file, name)
-        # Python's integers, because a product of damaged sizes can overflow numpy's.
+        # Use Python integers: the product of damaged sizes could overflow NumPy's.
         n_items = math.prod(shape)
         if n_items > MAX_ITEMS:
             count = n_items if n_items < 10**15 else "over 10**15"
@@ -409,7 +410,7 @@ def _read_array(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> n
                 f"holds {count} numbers, at most {MAX_ITEMS} can be read",
                 where=f"its array {name!r}",
             )
-        # No memory is allocated for a size that the data do not confirm.
+        # Do not allocate memory for a size that the data cannot fill.
         if n_items * dtype.itemsize > min(info.file_size, _MOST_DEFLATED * info.compress_size):
             raise EOFError
         array = np.empty(n_items, dtype)
@@ -419,7 +420,7 @@ def _read_array(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> n
 
 
 def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype[Any], bool, tuple[int, ...]]:
-    """Read a header as NumPy writes it. NumPy's own reader evaluates it, and warns."""
+    """Parse a header that NumPy wrote, without evaluating it as NumPy's own reader does."""
     start = file.read(8)
     n_length_bytes = 2 if start[6:7] == b"\1" else 4
     length = int.from_bytes(file.read(n_length_bytes), "little")
@@ -448,7 +449,7 @@ def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype[Any], bool, tuple
 
 
 def _fill(file: IO[bytes], array: npt.NDArray[Any]) -> None:
-    """Read an array's bytes in chunks, so that a file that ends early takes little memory."""
+    """Read an array's bytes in chunks, so that a truncated file takes little memory."""
     data = array.view(np.uint8)
     for start in range(0, len(data), _CHUNK_BYTES):
         part = data[start : start + _CHUNK_BYTES]
@@ -466,7 +467,7 @@ def write_npz(file: BinaryIO, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     file : open binary file
     arrays : plain arrays by name
     """
-    # Coordinates hardly shrink further at higher levels. Entries opened by name carry no date.
+    # Higher levels hardly compress coordinates further. Entries opened by name have no date.
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:

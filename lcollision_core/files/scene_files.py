@@ -1,4 +1,4 @@
-"""Files of scenes: characters and what else has nodes, skins and animations."""
+"""Read files of scenes: characters and other files with nodes, skins and animations."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from lcollision_core.files.table import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 
 SceneDocument: TypeAlias = GltfDocument | FbxDocument
-"""A file of a scene as it was read once, of which its scene, clips and looks are made."""
+"""A file of a scene, read once, from which its scene, clips and appearance are made."""
 
 
 def open_scene(path: str | os.PathLike[str], job: Job = UNWATCHED) -> SceneDocument:
-    """Read a file without making its scene; its extension says the format.
+    """Read a file without making its scene; the extension determines the format.
 
     Parameters
     ----------
-    path : of the file
-    job : polled while FBX is read, and its clips sampled
+    path : path of the file
+    job : polled while FBX is read and its clips are sampled
 
     Raises
     ------
-    MeshFileError : the file is missing, damaged or too large. The sentence names the file.
+    MeshFileError : the file is missing, damaged or too large. The message names the file.
     """
     with as_file_error(path), _opened(path) as file:
         return document_of(file, Path(path), job)
 
 
 def read_scene(source: str | os.PathLike[str] | SceneDocument, job: Job = UNWATCHED) -> Scene:
-    """Read what a file shows, without scenery about its characters.
+    """Read the scene of a file, without scenery around its characters.
 
     Parameters
     ----------
-    source : the file, or what `open_scene` returned
+    source : the file, or the result of `open_scene`
     job : see `open_scene`
 
     Raises
     ------
     CancelledError : the job was cancelled.
-    MeshFileError : as of `open_scene`, or the file is compressed, or shows no triangles.
+    MeshFileError : see `open_scene`; or the file is compressed, or shows no triangles.
     """
     document = source if isinstance(source, SceneDocument) else open_scene(source, job)
     with as_file_error(document.path):
@@ -59,11 +59,11 @@ def read_scene(source: str | os.PathLike[str] | SceneDocument, job: Job = UNWATC
 
 
 def read_skeleton_scene(path: str | os.PathLike[str], job: Job = UNWATCHED) -> Scene:
-    """Read the nodes and the clips of a file alone, whatever it shows, if anything.
+    """Read only the nodes and clips of a file, which need not have a mesh.
 
     Raises
     ------
-    CancelledError, MeshFileError : as of `read_scene`.
+    CancelledError, MeshFileError : see `open_scene`.
     """
     document = open_scene(path, job)
     with as_file_error(path):
@@ -73,7 +73,7 @@ def read_skeleton_scene(path: str | os.PathLike[str], job: Job = UNWATCHED) -> S
 
 
 def open_rigged(path: str | os.PathLike[str]) -> SceneDocument | None:
-    """Read a file of any kind, as `open_scene`, if it shows something that joints move."""
+    """Open a file as `open_scene` does; return None if it is not a scene with a skin."""
     if Path(path).suffix.lower() not in SCENE_SUFFIXES:
         return None
     document = open_scene(path)
@@ -81,13 +81,13 @@ def open_rigged(path: str | os.PathLike[str]) -> SceneDocument | None:
 
 
 def is_animation_alone(document: SceneDocument) -> bool:
-    """Whether a file is a scene with an animation and no mesh; it raises nothing of its own."""
+    """Whether a file has an animation but no mesh; return False for a damaged one."""
     try:
         scene_of(document)
     except NoMeshError:
         return True
     except LCollisionError:
-        # Reading it as what it is says so.
+        # The error is raised later, when the file is read.
         return False
     return False
 
@@ -107,14 +107,14 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def document_of(file: BinaryIO, path: Path, job: Job = UNWATCHED) -> SceneDocument:
-    """Read an open file at its start, as `open_scene`; the sentence does not name it."""
+    """Read an open file from its start, as `open_scene`; errors do not name it."""
     if path.suffix.lower() == ".fbx":
         return FbxDocument(read_rest(file), path, job)
     return GltfDocument(read_rest(file), path)
 
 
 def scene_of(document: SceneDocument) -> Scene:
-    """Make the scene of a file, as `read_scene`; the sentence does not name it."""
+    """Make the scene of a file, as `read_scene`; errors do not name it."""
     if isinstance(document, FbxDocument):
         return shown_scene(fbx.read_shown(document))
     return shown_scene(gltf_scene.read_shown(document))
@@ -122,11 +122,11 @@ def scene_of(document: SceneDocument) -> Scene:
 
 @contextmanager
 def as_file_error(path: str | os.PathLike[str], what: str = "cannot be read") -> Iterator[None]:
-    """Turn what goes wrong while a file is read, or `what` says, into one sentence that names it.
+    """Turn errors in the block into one error that names the file and says `what` failed.
 
     Raises
     ------
-    MeshFileError : anything of the file or the system went wrong.
+    MeshFileError : the block raised an error of the file or the system.
     """
     try:
         try:

@@ -1,6 +1,7 @@
-"""Every extension of a file: what it holds, who reads and writes it, what people call it.
+"""Table of file extensions: their content, reader, writer and label.
 
-The only list: a new format is a line of `FILES`, and a module with what that names.
+It is the only such list: to add a format, add an entry to `FILES`, and a module with the functions
+that it names.
 """
 
 from __future__ import annotations
@@ -12,14 +13,14 @@ from typing import Any
 
 
 class Holds(Flag):
-    """What files of an extension may hold."""
+    """Possible content of files with an extension."""
 
     MESH = auto()
     """Triangles, read by `read_mesh`."""
     SCENE = auto()
     """Nodes, skins and clips, read by `read_scene`."""
     GLTF = auto()
-    """A scene as glTF, of which all that no pose changes is kept."""
+    """A scene as glTF, which exports keep except for what a pose changes."""
     POINTS = auto()
     """The vertices of a mesh, frame by frame, without its faces."""
     SKELETON = auto()
@@ -33,21 +34,21 @@ class Holds(Flag):
     MODEL = auto()
     """A learned model."""
     PRINT = auto()
-    """A solid for a printer, in millimetres."""
+    """A solid for 3D printing, in millimetres."""
 
 
 @dataclass(frozen=True)
 class FileKind:
-    """One line of the table.
+    """One entry of the table.
 
     Attributes
     ----------
-    label : what people call the format
-    holds : what its files may hold
-    reader, writer : "module:function" of `lcollision_core`; "" where nothing reads or writes it
-    is_single : whether its meshes hold float32 coordinates only; others hold either precision
+    label : name of the format for users
+    holds : possible content of its files
+    reader, writer : "module:function" of `lcollision_core`; empty if there is none
+    is_single : whether its meshes store float32 coordinates only; others store either precision
     is_offered : whether the editor offers to write it
-    keeps_order : whether its meshes have the vertices of the program that wrote them, unsplit
+    keeps_order : whether its meshes keep the vertices of the program that wrote them, unsplit
     """
 
     label: str
@@ -107,7 +108,7 @@ FILES = {
 
 
 def suffixes_of(holds: Holds, *, written: bool = False) -> tuple[str, ...]:
-    """Return the extensions whose files hold any of these, in lower case; or those written."""
+    """Return the lower-case extensions with any of this content; if `written`, with a writer."""
     return tuple(
         suffix
         for suffix, kind in FILES.items()
@@ -122,16 +123,16 @@ def function_of(name: str) -> Any:
 
 
 READABLE_SUFFIXES = suffixes_of(Holds.MESH)
-"""Of files that `read_mesh` reads."""
+"""Files that `read_mesh` reads."""
 
 WRITABLE_SUFFIXES = suffixes_of(Holds.MESH, written=True)
-"""Of files that `write_mesh` writes."""
+"""Files that `write_mesh` writes."""
 
 PRINT_SUFFIXES = suffixes_of(Holds.PRINT, written=True)
-"""Of files that `print_pose` writes."""
+"""Files that `print_pose` writes."""
 
 SCENE_SUFFIXES = suffixes_of(Holds.SCENE)
-"""Of files that `read_scene` reads, and that are given back with a pose in them: FBX as GLB."""
+"""Files that `read_scene` reads, and that exports write with a pose, FBX as GLB."""
 
 GLTF_SUFFIXES = suffixes_of(Holds.GLTF)
 POINT_CACHE_SUFFIXES = suffixes_of(Holds.POINTS)
@@ -139,15 +140,15 @@ SKELETON_SUFFIXES = suffixes_of(Holds.SKELETON)
 CHARACTER_SUFFIXES = suffixes_of(Holds.SCENE | Holds.SMPL)
 
 ANIMATED_SUFFIXES = suffixes_of(Holds.SCENE | Holds.POINTS)
-"""Of files that `read_animated` reads."""
+"""Files that `read_animated` reads."""
 
 MOTION_SUFFIXES = suffixes_of(Holds.SCENE | Holds.POINTS | Holds.SKELETON | Holds.SMPL)
 
 OWN_SUFFIXES = (".bvh", ".npz")
-"""Of files of one motion that are written with that changed, and all else kept."""
+"""Files of one motion that can be written with the motion changed and all else kept."""
 
 LEARNED_FROM = suffixes_of(Holds.POINTS | Holds.POSE_SET)
-"""Of poses of one body: nothing to open, but to learn a model from."""
+"""Files with poses of one body, not to open but to learn a model from."""
 
 (SMPL_SUFFIX,) = suffixes_of(Holds.SMPL)
 (POSES_SUFFIX,) = suffixes_of(Holds.POSES)

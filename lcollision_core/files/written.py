@@ -1,7 +1,7 @@
-"""A character's glTF file with another pose or clip in it, which this program reads back.
+"""Write a character's glTF file with another pose or clip, and read it back.
 
-It is an object in `asset.extras` of the glTF file, and holds the parts of the source's description
-that the pose has changed, so that the source, which may be elsewhere, can be read from it again.
+A record in `asset.extras` of the glTF file holds the parts of the source's description that the
+pose has changed, so that the source character can be read without the source file.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _KEY, _VERSION = "lcollision", 1
 _LONGEST_NAME = 100
 _CLIPS, _SHOWING = "animations", ("scale", "weights")
 _CHANGED = ("nodes", "meshes", "skins", "scenes", "scene")
-"""What a pose changes of a description, apart from its animations."""
+"""Entries of a description that a pose changes, apart from animations."""
 
 
 def sign(
@@ -57,20 +57,20 @@ def sign(
     shown_by: Sequence[int],
     rules: ContactRules,
 ) -> None:
-    """Write into a file that holds a pose what it was before, and which pairs do not count.
+    """Record the source's description and the contact rules in a file that holds a pose.
 
     Parameters
     ----------
-    patch : the file, complete
-    source : the description that it had
-    character : with a rig, of that source
-    shown_by : of each of its parts the number of the node that shows it now
-    rules : of the character
+    patch : the complete file
+    source : description of the source
+    character : the source's character, with a rig
+    shown_by : for each of its parts, the number of the node that shows it now
+    rules : contact rules of the character
     """
     asset = patch.description.get("asset", {})
     extras = asset.get("extras", {}) if isinstance(asset, dict) else None
     if not isinstance(extras, dict):
-        # They are the source's own.
+        # The source uses this entry for something else.
         return
     patch.description["asset"] = asset = {**asset, "extras": {**extras}}
     before = {name: source.get(name) for name in _CHANGED}
@@ -88,9 +88,9 @@ def sign(
 
 
 def _brief(source: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the source's animations without how they turn and move its joints.
+    """Return the source's animations without the rotation and translation of joints.
 
-    What is left says which parts are a character's, and which faces are ever seen.
+    The rest determines which parts belong to a character and which faces are ever visible.
     """
     joints = {node for skin in source.get("skins", ()) for node in skin["joints"]}
     briefs = []
@@ -114,10 +114,10 @@ class OwnFile:
 
     Attributes
     ----------
-    character : in its rest pose, without clips
+    character : the character in its rest pose, without clips
     vertices : (V, 3) float64 array, the pose
-    rules : that the character had
-    roles : what its joints had been said to be, by their names
+    rules : contact rules of the character
+    roles : roles of its joints set by the user, by joint name
     """
 
     character: Character
@@ -131,7 +131,7 @@ def read_own_file(document: SceneDocument) -> OwnFile | None:
 
     Raises
     ------
-    MeshFileError : it was changed since, by another program, or is of a later version.
+    MeshFileError : another program has changed it since, or it is damaged or of another version.
     """
     if not isinstance(document, GltfDocument):
         return None
@@ -187,31 +187,31 @@ def read_own_file(document: SceneDocument) -> OwnFile | None:
 
 
 _SAME = 1e-6
-"""Normalised: what moves less has not moved."""
+"""Largest displacement, normalised, of a vertex that counts as unmoved."""
 
 _LARGEST_ERROR = 1e-5
-"""Normalised: how far vertices that joints place may be from those that were asked for."""
+"""Largest error, normalised, of the vertices in a written pose."""
 
 _SAME_TRANSFORM = 1e-9
-"""Of the largest number of a joint's transform: what changes less is rounding."""
+"""Largest change of a joint's transform, relative to its largest entry, that is rounding error."""
 
 _SAME_NUMBER = 1e-6
-"""Of a joint's translation or scale: what changes less keeps its text."""
+"""Largest relative change of a translation or scale for which the file's numbers are kept."""
 
 _OTHER_FORM = "write a point cache (.pc2), or each pose in a file of its own"
 
 _CLIP = "poses"
-"""The name of the clip that poses become."""
+"""Name of the clip made of several poses."""
 
 
 _WRITTEN_SUFFIXES = (".glb", ".vrm")
 
 
 class CharacterForm(StrEnum):
-    """How a character's file holds a pose.
+    """Export form of a pose in a character's file.
 
     JOINTS turns the joints of its skins. MESH is a static mesh without skin. MORPH adds a morph
-    target of weight 1 and leaves the shape of the source as the base.
+    target of weight 1 and keeps the shape of the source as the base.
     """
 
     JOINTS = "joints"
@@ -226,7 +226,7 @@ class PosedFile:
     Attributes
     ----------
     data : its bytes
-    vertices : (V, 3) float64 array, the character's vertices as readers of the file get them
+    vertices : (V, 3) float64 array, the character's vertices as readers of the file see them
     notes : sentences on what was left out
     """
 
@@ -246,37 +246,37 @@ def write_character(
     shapes: FloatArray | None = None,
     keep_clips: bool = False,
 ) -> PosedFile:
-    """Write the character's own .glb, .gltf or .vrm file with a pose, whole or not at all.
+    """Write the character's own .glb, .gltf or .vrm file with a pose, atomically.
 
     Textures, UVs, materials, extras and extensions stay byte for byte, and so do the number and
-    the order of vertices. A clip that moves what shapes the character is left out, because it,
-    not the pose, would be seen on opening, unless it is to be kept; cameras and lights keep theirs.
+    order of vertices. Clips that move the character are left out unless `keep_clips`, because
+    viewers would show them instead of the pose; clips of cameras and lights stay.
 
     Parameters
     ----------
-    path : a .glb file, or a .vrm file for a character of one
-    character : read from such a file, or made by `as_gltf` of another
+    path : a .glb file, or a .vrm file if the character is from one
+    character : read from such a file, or converted by `as_gltf`
     vertices : (V, 3) finite array, in its frame and unit
-    form : how the file holds the pose
-    transforms : (J, 4, 4) global transforms of the joints, for the form of joints
-    rules : the character's, which the file keeps: see `read_own_file`
-    shapes : (S,) sliders of its morph targets, for the form of joints; at rest if None
-    keep_clips : whether clips stay, and play as they did; for the form of joints alone
+    form : export form of the pose
+    transforms : (J, 4, 4) global transforms of the joints, for the form JOINTS
+    rules : contact rules of the character, stored in the file: see `read_own_file`
+    shapes : (S,) sliders of its morph targets, for the form JOINTS; at rest if None
+    keep_clips : whether clips stay and play as before; for the form JOINTS only
 
     Returns
     -------
-    what was written; its `vertices` are those to check
+    the written file; check its `vertices`
 
     Raises
     ------
-    ShapeError : another shape, or `transforms` are missing.
+    ShapeError : a shape is wrong, or `transforms` are missing.
     MeshFileError : the format of the source or of `path` cannot be written, the source cannot be
         read or has changed, or the file would be too large.
 
     Notes
     -----
-    A form that cannot hold the pose, as where the matrix of a joint's node shears, becomes MESH,
-    which holds any; the notes say so.
+    If a form cannot hold the pose, for example because the matrix of a joint's node has shear, MESH
+    is written instead, with a note.
     """
     require_written(path, character)
     form = CharacterForm(form)
@@ -322,14 +322,14 @@ def write_character(
 
 @dataclass(frozen=True, eq=False)
 class NewClip:
-    """A clip of its joints for a character's file.
+    """A new clip of the joints for a character's file.
 
     Attributes
     ----------
-    name : of the clip; numbered where the file has one of that name
-    fps : frames a second
+    name : name of the clip; numbered if the file has one of that name
+    fps : frames per second
     transforms : (N, J, 4, 4) global transforms of the joints
-    vertices : N arrays (V, 3), which the joints are to give, in the character's frame and unit
+    vertices : N arrays (V, 3) that the joints must reproduce, in the character's frame and unit
     shapes : (N, S) sliders of its morph targets; at rest if None
     """
 
@@ -351,26 +351,26 @@ def write_character_clip(
     shapes: FloatArray | None = None,
     keep_clips: bool = False,
 ) -> tuple[PosedFile, ...]:
-    """Write the character's own file with poses as a clip of its joints, which it opens with.
+    """Write the character's own file with poses as a clip of its joints, the first in the file.
 
     Parameters
     ----------
-    path : as of `write_character`
-    character : with a rig, read from a file as there
+    path : see `write_character`
+    character : see `write_character`; it must have a rig
     vertices : (N, V, 3) finite array, in its frame and unit
     transforms : (N, J, 4, 4) global transforms of the joints
-    fps : frames a second
-    rules : as of `write_character`
+    fps : frames per second
+    rules : see `write_character`
     shapes : (N, S) sliders of its morph targets; at rest if None
     keep_clips : whether its other clips stay, after this one
 
     Returns
     -------
-    for each frame the one file, and the vertices that readers get
+    for each frame, the same file and the vertices that readers see
 
     Raises
     ------
-    ShapeError, MeshFileError : as of `write_character`, and where the joints cannot hold a frame.
+    ShapeError, MeshFileError : see `write_character`; or the joints cannot reproduce a frame.
     """
     shape = (len(transforms), *character.rest_vertices.shape)
     if not shape[0] or vertices.shape != shape or character.rig is None:
@@ -394,14 +394,14 @@ def write_character_clips(
     *,
     keep_clips: bool = False,
 ) -> tuple[bytes, tuple[str, ...]]:
-    """Write the character's own file with new clips of its joints; it opens with the first.
+    """Write the character's own file with new clips of its joints before any others.
 
     Parameters
     ----------
-    path, character, rules, keep_clips : as of `write_character_clip`
-    clips : one at least
+    path, character, rules, keep_clips : see `write_character_clip`
+    clips : at least one clip
     seen : called in order for each frame of each clip with the clip's number and the (V, 3)
-        vertices that readers of the file get
+        vertices that readers of the file see
 
     Returns
     -------
@@ -410,7 +410,7 @@ def write_character_clips(
 
     Raises
     ------
-    ShapeError, MeshFileError : as of `write_character_clip`.
+    ShapeError, MeshFileError : see `write_character_clip`.
     """
     require_written(path, character)
     file = _file_of(character)
@@ -433,11 +433,11 @@ def write_character_clips(
 
 
 def require_written(path: str | os.PathLike[str], character: Character) -> None:
-    """Refuse a format that the character's own file cannot be given back as.
+    """Refuse a format in which the character's own file cannot be written.
 
     Raises
     ------
-    MeshFileError : it is another.
+    MeshFileError : the extension of `path` is not one of its formats.
     """
     suffix, target = Path(character.source).suffix.lower(), Path(path).suffix.lower()
     if target not in _WRITTEN_SUFFIXES or (target == ".vrm" and suffix != ".vrm"):
@@ -447,16 +447,16 @@ def require_written(path: str | os.PathLike[str], character: Character) -> None:
 
 
 def _file_of(character: Character) -> CharacterFile:
-    """Return what is written: what was read of the file, or is there now if that is as good.
+    """Return the file to write: as it was read, or as it is now if the mesh is unchanged.
 
     Raises
     ------
-    MeshFileError : the file cannot be read, or has another shape than the character.
+    MeshFileError : the file cannot be read, or no longer has the character's mesh.
     """
     path, file = Path(character.source), character.file
     with as_file_error(path):
         if file is not None and path.suffix.lower() not in GLTF_SUFFIXES:
-            # It was made of what was read.
+            # `as_gltf` made it from the original.
             return file
         data = read_regular(path, MAX_FILE_BYTES)
         if file is None or file.document.sha256 != hashlib.sha256(data).digest():
@@ -474,11 +474,11 @@ def _file_of(character: Character) -> CharacterFile:
 
 
 class _Source:
-    """The file of a character, to be written with one pose or clip.
+    """The file of a character, to be written with a pose or clips.
 
     Attributes
     ----------
-    patch : what is written
+    patch : the file to write
     size : body size
     """
 
@@ -492,14 +492,14 @@ class _Source:
         self._shown_by = [part.node for part, _, _ in file.parts]
 
     def signed(self, rules: ContactRules) -> bytes:
-        """Return the bytes of the file, which says what it was made of; see `own_files`."""
+        """Return the bytes of the file, with the record of its source; see `sign`."""
         character, source = self._character, self._file.editable.description
         if character.rig is not None:
             sign(self.patch, source, character, self._shown_by, rules)
         return self.patch.encoded()
 
     def require_near(self, stored: FloatArray, wanted: npt.NDArray[Any]) -> None:
-        """Refuse a form whose vertices are not those that were asked for."""
+        """Refuse a form that does not reproduce the wanted vertices."""
         error = float(np.abs(stored - wanted).max()) / self.size
         if not error <= _LARGEST_ERROR:
             raise UnwritablePoseError(
@@ -511,9 +511,9 @@ class _Source:
     def turn_joints(
         self, rig: Rig, transforms: FloatArray, shapes: FloatArray | None
     ) -> FloatArray:
-        """Give the joints' nodes these global transforms, and return where the vertices come.
+        """Set the global transforms of the joints' nodes, and return the vertices.
 
-        Nodes whose morph targets (S,) sliders weigh otherwise than at rest get these weights.
+        Set the weights of morph targets too, from (S,) sliders, if they differ from those at rest.
         """
         weights = self._weights(rig, shapes)
         for number, own in self._reweighed(weights).items():
@@ -530,26 +530,26 @@ class _Source:
         return self._posed(rig, transforms, hold, weights)
 
     def _weights(self, rig: Rig, shapes: FloatArray | None) -> tuple[FloatArray, ...]:
-        """Return the (N, M) weights of each part's morph targets, of (N, S) or (S,) sliders."""
+        """Return the (N, M) weights of each part's morph targets for (N, S) or (S,) sliders."""
         at_rest = self._scene.rest.weights
         if rig.shapes is None or shapes is None:
             return at_rest
         return rig.shapes.weights(np.atleast_2d(shapes), at_rest)
 
     def _reweighed(self, weights: tuple[FloatArray, ...]) -> dict[int, FloatArray]:
-        """Return the (N, M) weights of the nodes that have others than at rest."""
+        """Return the (N, M) weights of the nodes whose weights differ from those at rest."""
         parts, at_rest = self._scene.parts, by_node(self._scene.parts, self._scene.rest.weights)
         found = by_node(parts, weights)
         return {node: own for node, own in found.items() if (own != at_rest[node]).any()}
 
     def animate(self, rig: Rig, clip: NewClip, name: str, place: int) -> Iterator[FloatArray]:
-        """Add a clip that moves the joints' nodes and weighs morph targets.
+        """Add a clip of the joints' nodes and morph targets, and yield each frame's vertices.
 
-        It is there once all frames were asked for, of which each is where the vertices come.
+        The clip is added once all frames have been consumed.
 
         Parameters
         ----------
-        place : of the clip among the file's
+        place : index of the clip among the file's
         """
         transforms, weights = clip.transforms, self._weights(rig, clip.shapes)
         keys: dict[int, list[FloatArray]] = {}
@@ -585,7 +585,7 @@ class _Source:
                 )
                 samplers.append({**sampler, "interpolation": "LINEAR"})
             if node.pop("matrix", None) is not None:
-                # What is animated has no matrix.
+                # Animated nodes must not have a matrix.
                 node |= {part: track[0].tolist() for part, track in zip(PARTS, tracks, strict=True)}
         for number, values in self._reweighed(weights).items():
             sampler = {"input": times, "output": self.patch.add_array(values.reshape(-1, 1))}
@@ -604,13 +604,13 @@ class _Source:
         hold: Callable[[int, FloatArray], FloatArray],
         weights: tuple[FloatArray, ...],
     ) -> FloatArray:
-        """Return where the vertices come when the joints' nodes have these global transforms.
+        """Return the vertices with these global transforms of the joints' nodes.
 
         Parameters
         ----------
-        hold : gives a node, by its number, a new local transform, and returns what the file holds
-            of it
-        weights : of each part's morph targets, (1, M)
+        hold : stores a new local transform of a node, by its number, and returns it as rounded by
+            the file
+        weights : (1, M) weights of each part's morph targets
         """
         if transforms.shape != rig.rest.shape or not np.isfinite(transforms).all():
             raise ShapeError.must_be("transforms", f"of shape {rig.rest.shape}", transforms.shape)
@@ -626,7 +626,7 @@ class _Source:
             if number in joints:
                 new = _relative(wanted_above, wanted[number])
                 if np.abs(new - local).max() > _SAME_TRANSFORM * np.abs(new).max():
-                    # From the parent as the file will have it, so that rounding does not add up.
+                    # Relative to the parent as stored, so that rounding errors do not add up.
                     local = hold(number, _relative(above, wanted[number]))
             else:
                 wanted[number] = wanted_above @ local
@@ -635,7 +635,7 @@ class _Source:
         return posed
 
     def bake(self, vertices: FloatArray) -> FloatArray:
-        """Make static meshes of what moves, in the scene's coordinates, and return the vertices."""
+        """Make the parts that move static meshes in scene coordinates, and return the vertices."""
         stored = vertices.astype(np.float32).astype(np.float64)
         normals = self._file.normals(vertices)
         skinned = {part.node for part, _, _ in self._parts if part.is_skinned}
@@ -671,14 +671,14 @@ class _Source:
         return stored
 
     def _drop_binds(self) -> None:
-        """Remove from the expressions of a VRM what weighs morph targets that are not there."""
+        """Remove the weights of missing morph targets from the expressions of a VRM."""
         meshes = [
             number
             for number, mesh in enumerate(self.patch.description["meshes"])
             if any("targets" in primitive for primitive in mesh.get("primitives", ()))
         ]
         nodes = [number for number, node in enumerate(self._nodes) if node.get("mesh") in meshes]
-        # VRM 0 names the mesh, VRM 1 its node.
+        # VRM 0 refers to the mesh, VRM 1 to its node.
         kinds = (("binds", "mesh", meshes), ("morphTargetBinds", "node", nodes))
         left: list[Any] = [self.patch.description.get("extensions")]
         while left:
@@ -716,7 +716,7 @@ class _Source:
             primitive = self._own_mesh(shown)["primitives"][shown.primitive]
             target = {"POSITION": self._vectors(deltas, has_bounds=True)}
             if own_normals is not None:
-                # A reader turns normals by the inverse transpose.
+                # Readers transform normals by the inverse transpose.
                 turned = np.einsum("vij,vi->vj", turns[:, :, :3], normals[rows])
                 target["NORMAL"] = self._vectors(unit(turned) - own_normals)
             most = max(len(primitive.get("targets", ())) for primitive in mesh["primitives"])
@@ -727,11 +727,11 @@ class _Source:
         return stored
 
     def _weigh_morph(self, node: dict[str, Any]) -> None:
-        """Give the newest morph target of a node's mesh its weight, and a name if all have one."""
+        """Set the weight of the last morph target of a node's mesh, and a name if all have one."""
         mesh = self.patch.description["meshes"][node["mesh"]]
         n_targets = max(len(primitive.get("targets", ())) for primitive in mesh["primitives"])
         for primitive in mesh["primitives"]:
-            # Lines and points.
+            # Primitives of lines and points too.
             self._fill_targets(primitive, n_targets)
         for owner in (mesh, node):
             if owner is mesh or "weights" in owner:
@@ -744,14 +744,14 @@ class _Source:
                 extras["targetNames"] = [*names, "pose"]
 
     def _fill_targets(self, primitive: dict[str, Any], n_targets: int) -> None:
-        """Add morph targets that move nothing, as all primitives of a mesh have equally many."""
+        """Add empty morph targets, as all primitives of a mesh must have the same number."""
         position = primitive["attributes"].get("POSITION")
         while position is not None and len(primitive.setdefault("targets", [])) < n_targets:
             zeros = np.zeros((self.patch.description["accessors"][position]["count"], 3))
             primitive["targets"].append({"POSITION": self._vectors(zeros, has_bounds=True)})
 
     def drop_clips(self) -> list[str]:
-        """Remove the animations that move what shapes the character, and return their names."""
+        """Remove the animations that move the character, and return their names."""
         animations = self.patch.description.pop("animations", [])
         hiding = self._hiding(animations)
         kept = [animation for number, animation in enumerate(animations) if number not in hiding]
@@ -760,7 +760,7 @@ class _Source:
         return [str(animations[number].get("name", f"animation {number}")) for number in hiding]
 
     def hold_clips(self) -> None:
-        """Hold in each animation, at its old value, what the pose changed and no channel drives."""
+        """Add constant channels for the old values that the pose changed and no channel drives."""
         before = self._file.editable.objects("nodes")
         changed = [
             (number, path, old)
@@ -777,7 +777,7 @@ class _Source:
         for number in self._hiding(animations):
             samplers = [*animations[number].get("samplers", ())]
             channels = [*animations[number].get("channels", ())]
-            # At times that the animation has, as others would make it longer.
+            # Use existing times of the animation: others might make it longer.
             times = samplers[channels[0]["sampler"]]["input"]
             n_times = self.patch.description["accessors"][times]["count"]
             driven = {
@@ -795,7 +795,7 @@ class _Source:
             animations[number] = animations[number] | animation
 
     def _hiding(self, animations: list[dict[str, Any]]) -> list[int]:
-        """Return the numbers of the animations that move what shapes the character."""
+        """Return the numbers of the animations that move the character."""
         parents = self._scene.parents
         shaping = {part.node for part, _, _ in self._parts}
         for part, _, _ in self._parts:
@@ -806,7 +806,7 @@ class _Source:
 
         def shows_pose(animation: dict[str, Any]) -> bool:
             targets = [channel["target"] for channel in animation.get("channels", ())]
-            # What has no node is a pointer to anything, by an extension.
+            # A target without node may point to anything, by an extension.
             return all("node" in target and target["node"] not in shaping for target in targets)
 
         return [number for number, animation in enumerate(animations) if not shows_pose(animation)]
@@ -815,7 +815,7 @@ class _Source:
         return self.patch.add_array(values, has_bounds=has_bounds, target=VERTEX_DATA)
 
     def _own_mesh(self, shown: Primitive) -> dict[str, Any]:
-        """Return the mesh of a node, after copying it where other nodes show it too."""
+        """Return the mesh of a node, copied first if other nodes show it too."""
         meshes: list[dict[str, Any]] = self.patch.description["meshes"]
         node = self._nodes[shown.node]
         if shown.n_instances > 1:
@@ -831,7 +831,7 @@ class _Source:
         return mesh
 
     def _move_to_root(self, number: int) -> None:
-        """Take a node's mesh out of its skin, to where the scene's coordinates are its own."""
+        """Remove a node's skin, and move its mesh to where local coordinates are the scene's."""
         node = self._nodes[number]
         node.pop("skin", None)
         node.pop("weights", None)
@@ -847,7 +847,7 @@ class _Source:
             "matrix",
             "extras",
         }:
-            # Others hang on this one.
+            # The node has further uses, such as children, so move only its mesh.
             self._nodes.append({"name": node.get("name", "mesh"), "mesh": node.pop("mesh")})
             new = len(self._nodes) - 1
             self._shown_by = [new if shown == number else shown for shown in self._shown_by]
@@ -867,7 +867,7 @@ class _Source:
 
 
 def _relative(above: FloatArray, transform: FloatArray) -> FloatArray:
-    """Return a global transform relative to its parent's."""
+    """Return a global transform relative to that of its parent."""
     try:
         return np.linalg.solve(above, transform).astype(np.float64)
     except np.linalg.LinAlgError as error:
@@ -875,12 +875,12 @@ def _relative(above: FloatArray, transform: FloatArray) -> FloatArray:
 
 
 def _held(node: dict[str, Any], local: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the translation, rotation and scale that a file holds of a node's local transform.
+    """Return the translation, rotation and scale that a file stores for a local transform.
 
-    A translation or a scale that stays, as where a joint only turns, is the one of the node.
+    An unchanged translation or scale, as of a joint that only turns, is that of the node.
     """
     old_translation, _, old_scale = stored_parts(node)
-    # The axes that the node reflects, where it reflects some.
+    # Axes that the node reflects.
     signs = np.where(old_scale < 0.0, -1.0, 1.0)
     translation, rotation, scale = decompose(local * np.append(signs, 1.0))
     return (

@@ -1,1 +1,1 @@
-"""glTF 2.0: its schema, and reading and writing by it."""
+"""glTF 2.0: schema, reader and writer."""

@@ -1,4 +1,4 @@
-"""The animations of a glTF file: channels that move nodes and weigh morph targets over time."""
+"""The animations of a glTF file: channels that move nodes and weight morph targets over time."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ POINTER = "KHR_animation_pointer"
 _NODE_POINTER = re.compile(r"/nodes/(\d{1,9})/(translation|rotation|scale|weights)")
 
 _SAME_TIME = 1e-5
-"""Seconds: keys are stored in single precision."""
+"""Tolerance of key times in seconds, as they are stored in single precision."""
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One property of C nodes that have the same key times.
+    """One property of C nodes with the same key times.
 
     Attributes
     ----------
-    nodes, path : what it drives
+    nodes, path : the driven nodes and property
     interpolation : STEP, LINEAR or CUBICSPLINE
     times : (T,) float64 array, ascending
-    values : (T, C, k) float64 array, for CUBICSPLINE (T, 3, C, k): tangent in, value, tangent out
+    values : (T, C, k) float64 array; for CUBICSPLINE (T, 3, C, k): in-tangent, value, out-tangent
     """
 
     nodes: tuple[int, ...]
@@ -60,7 +60,7 @@ class Track:
     values: FloatArray
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Return the (N, C, k) values at (N,) times, the first before all keys, the last after."""
+        """Return the (N, C, k) values at (N,) times, clamped to the first and last key."""
         before = np.searchsorted(self.times, times, side="right") - 1
         before = np.clip(before, 0, len(self.times) - 1)
         after = np.minimum(before + 1, len(self.times) - 1)
@@ -90,16 +90,16 @@ class Track:
     def with_span(
         self, before: float | None, times: FloatArray, after: float | None, values: FloatArray
     ) -> Track:
-        """Return the track with linear keys in a span of time; outside of it nothing changes.
+        """Return the track with new linear keys in a span of time, unchanged elsewhere.
 
-        From the frame before the span, and to the frame after it, the property moves in a straight
-        line. The keys of a stepped track become pairs of linear ones.
+        The property moves linearly from the frame before the span and to the frame after it. The
+        keys of a stepped track become pairs of linear ones.
 
         Parameters
         ----------
-        before, after : the times of the frames on either side; None where there is none
+        before, after : times of the frames on either side; None if there is none
         times : (n,) float64 array, ascending, between them
-        values : (n, C, k) float64 array
+        values : (n, C, k) float64 array, the new values
         """
         track = self._unstepped()
         lead, tail = ([] if track is None else [track] for track in (before, after))
@@ -128,7 +128,7 @@ class Track:
         )
 
     def _unstepped(self) -> Track:
-        """Return the same with linear keys: a step from just before a key to the key."""
+        """Return a stepped track with linear keys, a pair on either side of each step."""
         if self.interpolation != "STEP":
             return self
         just_before = np.nextafter(self.times[1:].astype(np.float32), np.float32(-np.inf))
@@ -140,7 +140,7 @@ class Track:
         )
 
     def _slope(self, time: FloatArray, side: Literal["left", "right"]) -> FloatArray:
-        """Return the (1, C, k) slope of a cubic curve at a (1,) time, on one side of it."""
+        """Return the one-sided (1, C, k) slope of a cubic curve at a (1,) time."""
         at = np.searchsorted(self.times, time + (_SAME_TIME if side == "right" else -_SAME_TIME))
         start, end = at - 1, at
         if start[0] < 0 or end[0] == len(self.times):
@@ -161,7 +161,7 @@ class ClipTracks:
 
     Attributes
     ----------
-    number : of the animation in the file
+    number : index of the animation in the file
     document : the file
     driven : see `_GltfClip`
     """
@@ -176,11 +176,11 @@ class ClipTracks:
 
         Parameters
         ----------
-        parts : whose morph targets it weighs
+        parts : parts whose morph targets it may weight
 
         Raises
         ------
-        MeshFileError : there is none.
+        MeshFileError : there is no such animation.
         """
         animations = document.objects("animations")
         names = _names(animations)
@@ -194,13 +194,13 @@ class ClipTracks:
     def track(
         self, node: int, path: str, start: float = 0.0, at_rest: FloatArray | None = None
     ) -> Track:
-        """Return one property of a node; where the animation leaves it alone, one key at `start`.
+        """Return the track of a node's property; if it is not animated, one key at `start`.
 
-        A start that is the animation's own makes it no longer.
+        Pass the start of the animation, so that the key does not make it longer.
 
         Parameters
         ----------
-        at_rest : the weights of its morph targets at rest, of these
+        at_rest : weights of the morph targets at rest, for the property "weights"
         """
         if (node, path) not in self.driven:
             stored = at_rest
@@ -209,7 +209,7 @@ class ClipTracks:
             return Track((node,), path, "LINEAR", np.full(1, start), stored[None, None])
         sampler, width = self.driven[node, path]
         what = f"the {path} of node {node}"
-        # Clips that are changed were sampled; a file is written many times.
+        # Changed clips were sampled before, so do not count their numbers again.
         read = partial(self.document.array, again=True)
         times = as_float(read(sampler["input"], what, ("SCALAR",))[:, 0])
         interpolation = sampler.get("interpolation", "LINEAR")
@@ -221,18 +221,18 @@ class ClipTracks:
 
 @dataclass(frozen=True, eq=False)
 class _GltfClip:
-    """Samples an animation, whose arrays are read when it is first asked.
+    """Samples an animation, whose arrays are read on first use.
 
     Attributes
     ----------
     document : the file
-    where : what a sentence calls the animation
-    driven : by node and property, the sampler and how many numbers it has for each key
-    stored : from a node to its translation, rotation and scale in the file
-    local : (n, 4, 4) array, the nodes as the file stores them
-    parents, order : of the nodes
-    part_nodes : of each part the node that shows it
-    default_weights : of each part
+    where : name of the animation in error messages
+    driven : the sampler, and its numbers per key, by node and property
+    stored : returns the translation, rotation and scale of a node in the file
+    local : (n, 4, 4) array, local transforms of the nodes in the file
+    parents, order : parents of the nodes, and their order with parents first
+    part_nodes : the node that shows each part
+    default_weights : weights of each part's morph targets in the file
     """
 
     document: GltfDocument
@@ -247,12 +247,12 @@ class _GltfClip:
 
     @property
     def moved(self) -> frozenset[int]:
-        """The nodes that it moves."""
+        """The nodes that the animation moves."""
         return frozenset(node for node, path in self.driven if path != _WEIGHTS)
 
     @cached_property
     def _times(self) -> dict[int, FloatArray]:
-        """The (T,) times of the keys, by accessor; equal ones are one array."""
+        """The (T,) key times by accessor; equal times share an array."""
         what = f"the times of {self.where}"
         times_of: dict[int, FloatArray] = {}
         known: dict[bytes, FloatArray] = {}
@@ -300,7 +300,7 @@ class _GltfClip:
         ]
 
     def _checked(self, stored: list[npt.NDArray[Any]], path: str) -> FloatArray:
-        """Put the values of the nodes of a track together, rotations of length 1."""
+        """Stack the values of a track's nodes, with rotations normalised."""
         values = as_float(np.stack(stored, axis=-2))
         broken = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
         if len(broken):
@@ -347,20 +347,20 @@ def read_clips(
     parts: Sequence[Part],
     default_weights: tuple[FloatArray, ...],
 ) -> tuple[Clip, ...]:
-    """Return the animations that move a node or weigh a morph target; their arrays are read later.
+    """Return the animations that move a node or weight a morph target; arrays are read later.
 
     Parameters
     ----------
     document : the file
-    local : (n, 4, 4) array, the nodes as stored
-    parents, order : of the nodes
-    parts : what the nodes show
-    default_weights : of each part's morph targets
+    local : (n, 4, 4) array, local transforms of the nodes in the file
+    parents, order : parents of the nodes, and their order with parents first
+    parts : parts that the nodes show
+    default_weights : weights of each part's morph targets in the file
 
     Raises
     ------
-    MeshFileError : an animation names an unknown node or sampler. Arrays of a damaged animation
-        raise it when they are read.
+    MeshFileError : an animation refers to an unknown node or sampler. Damaged arrays raise it when
+        they are read.
     """
     animations = document.objects("animations")
     names = _names(animations)
@@ -389,7 +389,7 @@ def read_clips(
 
 
 def _target_counts(parts: Sequence[Part]) -> dict[int, int]:
-    """Return how many morph targets each node weighs."""
+    """Return the number of morph targets of each node."""
     counts: dict[int, int] = {}
     for part in parts:
         counts[part.node] = max(len(part.morphs), counts.get(part.node, 0))
@@ -407,7 +407,7 @@ def _stored(node: dict[str, Any], number: int) -> dict[str, FloatArray]:
 
 
 def driven_property(channel: dict[str, Any]) -> tuple[Any, Any]:
-    """Return the node, and which of its properties, that a channel says it drives; else None."""
+    """Return the node and the property that a channel drives; None if it names none."""
     target = channel.get("target", {})
     return pointed_node(target) or (target.get("node"), target.get("path"))
 
@@ -434,12 +434,12 @@ def _driven(
 
 
 def pointed_node(target: dict[str, Any]) -> tuple[int, str] | None:
-    """Return the node, and which of its own properties, that a channel names by a pointer."""
+    """Return the node and the property that a channel's pointer refers to, if it does."""
     match = _NODE_POINTER.fullmatch(pointer_of(target))
     return (int(match[1]), match[2]) if match else None
 
 
 def pointer_of(target: dict[str, Any]) -> str:
-    """Return what a channel points at; empty where it names a node."""
+    """Return the pointer of a channel; empty if it names a node instead."""
     pointer = extension_of(target, POINTER).get("pointer")
     return pointer if target.get("path") == "pointer" and isinstance(pointer, str) else ""

@@ -1,4 +1,4 @@
-"""How the primitives of a glTF file look: base colours, textures and vertex colours."""
+"""Appearance of the primitives of a glTF file: base colours, textures and vertex colours."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ _GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 
 @dataclass(frozen=True, eq=False)
 class _Finish:
-    """A material of a file, and what of it is laid into the points of a primitive.
+    """A material of a file, and its values that are stored in the points of a primitive.
 
     Attributes
     ----------
-    material : without its colour
+    material : the material without its colour
     colour : (4,) array, linear
-    uv_set : the number of its texture coordinates
-    turned, offset : (2, 2) and (2,) arrays: from (2,) coordinates to turned @ uv + offset
-    notes : sentences
+    uv_set : number of its set of texture coordinates
+    turned, offset : (2, 2) and (2,) arrays of the transform `turned @ uv + offset`
+    notes : sentences on what could not be read
     """
 
     material: Material
@@ -61,9 +61,9 @@ _NO_FINISH = _Finish(Material(is_double_sided=False), np.ones(4), 0, np.eye(2), 
 
 
 class GltfLooks:
-    """Reads how the primitives of one file look, each image and material once.
+    """Reads the appearance of a file's primitives, each image and material once.
 
-    What is damaged is left out, and noted.
+    Damaged values are left out with a note.
 
     Parameters
     ----------
@@ -85,15 +85,15 @@ class GltfLooks:
         n_copies: int,
         where: str,
     ) -> Appearance:
-        """Read how a primitive looks.
+        """Read the appearance of a primitive.
 
         Parameters
         ----------
-        primitive : of the description; the number of its material is right
+        primitive : its description, whose material index has been checked
         faces : (F, 3) array, the triangles of all its copies
-        n : its vertices, each of which is a point
-        n_copies : how often it is shown
-        where : as in "mesh 3"
+        n : number of its vertices, each of which is a point
+        n_copies : number of copies shown
+        where : name in notes, such as "mesh 3"
         """
         finish = _NO_FINISH
         if "material" in primitive:
@@ -109,7 +109,7 @@ class GltfLooks:
                 colours *= self._vertex_colours(attributes["COLOR_0"], where, n)
         with _noted(notes, f"{where} is shown without its texture"):
             if material.texture is not None:
-                # In its colour alone, unless all is well.
+                # Keep only the colour unless the coordinates can be read.
                 material = replace(material, texture=None)
                 what = f"the texture coordinates of {where}"
                 given = attributes.get(f"TEXCOORD_{finish.uv_set}")
@@ -117,7 +117,7 @@ class GltfLooks:
                 require_finite(stored, what)
                 uv, material = stored @ finish.turned.T + finish.offset, finish.material
             elif "TEXCOORD_0" in attributes:
-                # Nothing shows them, but exports hold them.
+                # Nothing uses them on screen, but exports keep them.
                 what = f"the texture coordinates of {where}"
                 stored = as_float(
                     self._document.array(attributes["TEXCOORD_0"], what, ("VEC2",), n)
@@ -136,7 +136,7 @@ class GltfLooks:
     def _vertex_colours(self, accessor: object, where: str, n: int) -> FloatArray:
         what = f"the colours of {where}"
         stored = self._document.array(accessor, what, ("VEC3", "VEC4"), n)
-        # Some programs do not say that their whole numbers are normalised.
+        # Some programs do not mark their integers as normalised.
         most = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1.0
         colours = np.ones((n, 4))
         colours[:, : stored.shape[1]] = np.clip(as_float(stored) / most, 0.0, 1.0)
@@ -147,7 +147,7 @@ class GltfLooks:
         described = self._document.objects("materials")[number]
         name = quoted(described.get("name") or number)
         finish, notes = _NO_FINISH, list[str]()
-        # Its colour stays where its texture is damaged.
+        # Keep the colour even if the texture is damaged.
         with _noted(notes, f"the material {name} is not shown as it is"):
             mode, extensions = described.get("alphaMode"), _inner(described, "extensions")
             cutoff = described.get("alphaCutoff", 0.5) if mode == "MASK" else 0.0
@@ -168,7 +168,7 @@ class GltfLooks:
         return replace(finish, notes=tuple(notes))
 
     def _textured(self, finish: _Finish, laid: dict[str, Any]) -> _Finish:
-        """Add a texture, given what a material says of it."""
+        """Add the texture that a material refers to."""
         moved = _inner(_inner(laid, "extensions"), "KHR_texture_transform")
         uv_set = moved.get("texCoord", laid.get("texCoord", 0))
         angle = float(numbers([moved.get("rotation", 0.0)], "its texture's rotation", 1)[0])
@@ -191,7 +191,7 @@ class GltfLooks:
         source: Any = texture.get("source")
         others = _inner(texture, "extensions")
         if source is None:
-            # Of the formats that extensions add, those that can be read.
+            # The image may be in a format that an extension adds.
             source = next((_inner(others, name).get("source") for name in others), None)
         image = element(document.objects("images"), source, "an image")
         if source not in self._pixels:
@@ -216,7 +216,7 @@ def _code(sampler: dict[str, Any], key: str) -> int:
 
 
 def _inner(described: dict[str, Any], key: str) -> dict[str, Any]:
-    """Return an object in another one; an empty one where there is none."""
+    """Return an object in another one; empty if there is none."""
     value = described.get(key, {})
     if not isinstance(value, dict):
         raise MeshFileError.must_be(f"its {key}", "an object", quoted(value))

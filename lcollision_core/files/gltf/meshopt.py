@@ -1,7 +1,7 @@
-"""Decodes the buffers of EXT_meshopt_compression and KHR_meshopt_compression.
+"""Decode the buffers of EXT_meshopt_compression and KHR_meshopt_compression.
 
-After the appendices of their specifications: rows of bytes (version 0 and 1), triangles, sequences
-of indices, and filters of rows.
+Follows the appendices of their specifications: rows of bytes (versions 0 and 1), triangles, index
+sequences, and row filters.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from lcollision_core.errors import MeshFileError
 Bytes = npt.NDArray[np.uint8]
 
 _PADDING = 512
-"""Zeros behind the data: more than is read between two looks at where that ends."""
+"""Zeros after the data, more than are read between two checks for its end."""
 
 _BLOCK_BYTES, _BLOCK_ROWS, _GROUP = 8192, 256, 16
 _LARGEST_STRIDE = 256
@@ -28,8 +28,8 @@ def decode(data: bytes, count: int, stride: int, mode: str, kind: str = "NONE") 
 
     Parameters
     ----------
-    data : as stored
-    count, stride : of the elements, and bytes of each
+    data : the compressed bytes
+    count, stride : number of elements, and bytes per element
     mode : ATTRIBUTES, TRIANGLES or INDICES
     kind : the filter: NONE, OCTAHEDRAL, QUATERNION, EXPONENTIAL or COLOR
 
@@ -39,7 +39,7 @@ def decode(data: bytes, count: int, stride: int, mode: str, kind: str = "NONE") 
 
     Raises
     ------
-    MeshFileError : the data are damaged, or of an unknown form.
+    MeshFileError : the data are damaged, or of an unknown format.
     """
     packed = np.frombuffer(data + bytes(_PADDING), dtype=np.uint8)
     if mode == "ATTRIBUTES" and stride % 4 == 0 and 0 < stride <= _LARGEST_STRIDE:
@@ -59,7 +59,7 @@ def _damaged() -> MeshFileError:
 
 
 def _rows(packed: Bytes, count: int, stride: int) -> Bytes:
-    """Return (count, stride) bytes: the deltas of each byte, 16-bit or 32-bit number summed up."""
+    """Return (count, stride) bytes by summing the deltas of each 8, 16 or 32-bit number."""
     version = int(packed[0]) - 0xA0
     tail = stride if version == 0 else stride + stride // 4
     end = len(packed) - _PADDING - max(tail, 32 if version == 0 else 24)
@@ -91,7 +91,7 @@ def _rows(packed: Bytes, count: int, stride: int) -> Bytes:
 
 @compiled
 def _read_deltas(packed: Bytes, end: int, deltas: Bytes) -> int:
-    """Fill (n, stride) deltas, column by column of each block; return where the data end, or -1."""
+    """Fill (n, stride) deltas, column by column per block; return the end of the data, or -1."""
     n, stride = deltas.shape
     is_new, at = packed[0] == 0xA1, 1
     most = min((_BLOCK_BYTES // stride) & ~(_GROUP - 1), _BLOCK_ROWS)
@@ -123,7 +123,7 @@ def _read_deltas(packed: Bytes, end: int, deltas: Bytes) -> int:
                 if n_bits == 0:
                     continue
                 first = start + _GROUP * group
-                # Numbers of all ones are escapes: the bytes themselves follow.
+                # All bits set is an escape: the byte itself follows.
                 escape, more = (1 << n_bits) - 1, at + 2 * n_bits
                 for place in range(_GROUP):
                     bit = place * n_bits
@@ -139,7 +139,7 @@ def _read_deltas(packed: Bytes, end: int, deltas: Bytes) -> int:
 
 
 def _filtered(rows: Bytes, kind: str) -> npt.NDArray[Any]:
-    """Undo a filter of (n, stride) rows."""
+    """Undo the filter of (n, stride) rows."""
     stride = rows.shape[1]
     rows = np.ascontiguousarray(rows)
     if kind == "NONE":
@@ -188,7 +188,7 @@ def _signed(value: int) -> int:
 
 @compiled_part
 def _number(packed: Bytes, at: int) -> tuple[Any, int]:
-    """Return a number of 7 bits a byte, and where the next begins."""
+    """Return a number with 7 bits per byte, and the position after it."""
     value = np.int64(0)
     for shift in range(0, 35, 7):
         byte = np.int64(packed[at])
@@ -201,7 +201,7 @@ def _number(packed: Bytes, at: int) -> tuple[Any, int]:
 
 @compiled
 def _sequence(packed: Bytes, indices: npt.NDArray[np.uint32]) -> bool:
-    """Read indices as differences from either of two; False where data are missing."""
+    """Read indices as differences from either of two previous ones; False if truncated."""
     at, end, last = 1, len(packed) - _PADDING - 4, np.zeros(2, dtype=np.int64)
     for place in range(len(indices)):
         if at >= end:
@@ -214,7 +214,7 @@ def _sequence(packed: Bytes, indices: npt.NDArray[np.uint32]) -> bool:
 
 @compiled
 def _triangles(packed: Bytes, indices: npt.NDArray[np.uint32]) -> bool:
-    """Read triangles as edges and vertices of those before; False where data are missing."""
+    """Read triangles that reuse edges and vertices of earlier ones; False if truncated."""
     n = len(indices) // 3
     code, at, table = 1, 1 + n, len(packed) - _PADDING - 16
     if at > table or len(indices) % 3:

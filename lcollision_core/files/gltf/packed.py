@@ -1,4 +1,4 @@
-"""Unpacks what extensions compress in a glTF file, so that it is read as one without them."""
+"""Unpack the compressed data of a glTF file, so that it can be read like any other."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _MOST_STRIDE = 256
 
 
 def unpack(document: GltfDocument) -> None:
-    """Give a document plain copies of the buffer views and primitives that have none.
+    """Add uncompressed copies of the buffer views and primitives that lack them.
 
     Raises
     ------
     MeshFileError : compressed data are damaged.
-    MissingExtraError : they are compressed by Draco, and DracoPy is not installed.
+    MissingExtraError : data are compressed by Draco, and DracoPy is not installed.
     """
     for number, view in enumerate(document.objects("bufferViews")):
         held = next((one for name in MESHOPT if (one := extension_of(view, name))), None)
@@ -70,7 +70,7 @@ def _draco(
     where: str,
     unpacked: dict[int, Any],
 ) -> None:
-    """Give the accessors of a primitive the data that Draco holds of them."""
+    """Add the data that Draco compresses to the accessors of a primitive."""
     try:
         import DracoPy
     except ImportError as error:

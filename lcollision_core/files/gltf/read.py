@@ -1,4 +1,4 @@
-"""The nodes, meshes, skins and morph targets that a glTF file shows, and its extensions."""
+"""Read the nodes, meshes, skins and morph targets of a glTF file, and its extensions."""
 
 from __future__ import annotations
 
@@ -59,18 +59,18 @@ _APPEARANCE = re.compile(
     "single_root|ngon|manifold",
     re.IGNORECASE,
 )
-"""Words in the names of extensions that neither shape nor move what a file shows."""
+"""Words in the names of extensions that neither shape nor move the meshes."""
 
 _MOTION = re.compile("physics|spring|collider|rigid|jiggle", re.IGNORECASE)
-"""Words in the names of those that only move it while it is played."""
+"""Words in the names of extensions that only move meshes in a simulation."""
 
 
 def require_readable(document: GltfDocument) -> None:
-    """Refuse a file that needs an extension that may change its shape and is not read.
+    """Refuse a file that requires an unsupported extension which may change its shape.
 
     Raises
     ------
-    MeshFileError : it does; the sentence names the extension.
+    MeshFileError : the file requires such an extension, which the message names.
     """
     known = _READ | COMPRESSIONS
     for name in document.description.get("extensionsRequired", ()):
@@ -83,7 +83,7 @@ def require_readable(document: GltfDocument) -> None:
 
 
 def notes_on_extensions(document: GltfDocument) -> Iterator[str]:
-    """Yield sentences on what extensions would do to shape or pose, and is left out."""
+    """Yield notes on unsupported extensions that affect shape or pose."""
     nodes = document.objects("nodes")
     constrained = [
         _called(document, "nodes", number)
@@ -114,10 +114,10 @@ def notes_on_extensions(document: GltfDocument) -> Iterator[str]:
 def left_out_nodes(
     document: GltfDocument, parents: npt.NDArray[np.int64]
 ) -> tuple[set[int], list[str]]:
-    """Return the nodes whose meshes are not shown, and sentences on those meshes.
+    """Return the nodes whose meshes are not shown, and notes on those meshes.
 
-    They are hidden (KHR_node_visibility), lower levels of detail (MSFT_lod), with all below them,
-    or what only the wearer of a VRM avatar sees.
+    These are hidden nodes (KHR_node_visibility) and lower levels of detail (MSFT_lod), each with
+    its descendants, and meshes that only the wearer of a VRM avatar sees.
     """
     nodes = document.objects("nodes")
     hidden = [
@@ -151,7 +151,7 @@ def _with_all_below(chosen: Iterable[object], parents: npt.NDArray[np.int64]) ->
 
 
 def _first_person(document: GltfDocument) -> Iterator[int]:
-    """Yield the nodes that VRM 1.0, or by their meshes VRM 0.x, shows to the wearer alone."""
+    """Yield the nodes that VRM 1.0, or VRM 0.x by their meshes, shows to the wearer only."""
     for extension, key, kind in (("VRMC_vrm", "node", "type"), ("VRM", "mesh", "firstPersonFlag")):
         seen = inner(extension_of(document.description, extension), "firstPerson")
         for annotation in _listed(seen.get("meshAnnotations")):
@@ -165,15 +165,15 @@ def _first_person(document: GltfDocument) -> Iterator[int]:
 
 
 def instances(document: GltfDocument, number: int) -> FloatArray | None:
-    """Return the (n, 4, 4) transforms, relative to a node, at which its mesh is shown.
+    """Return the (n, 4, 4) transforms of the instances of a mesh, relative to its node.
 
     Returns
     -------
-    None without EXT_mesh_gpu_instancing: it is shown once, at the node
+    None without EXT_mesh_gpu_instancing: the mesh is shown once, at the node
 
     Raises
     ------
-    MeshFileError : the transforms are damaged, or not equally many.
+    MeshFileError : the transforms are damaged, or their counts differ.
     """
     attributes = extension_of(document.objects("nodes")[number], _INSTANCING).get("attributes")
     if not isinstance(attributes, dict) or not attributes:
@@ -187,7 +187,7 @@ def instances(document: GltfDocument, number: int) -> FloatArray | None:
             arrays[name] = as_float(document.array(attributes[name], what, (kind,), count))
             require_finite(arrays[name], what)
     if not arrays:
-        # Custom attributes alone move nothing, but say how many there are.
+        # Custom attributes do not move anything, but give the number of instances.
         kinds = ("SCALAR", "VEC2", "VEC3", "VEC4")
         arrays["custom"] = document.array(next(iter(attributes.values())), where, kinds)
     n = len(next(iter(arrays.values())))
@@ -199,17 +199,17 @@ def instances(document: GltfDocument, number: int) -> FloatArray | None:
 
 
 def _called(document: GltfDocument, kind: str, number: int) -> str:
-    """Return what a sentence calls a node or a mesh."""
+    """Return the name of a node or mesh for messages."""
     objects = document.objects(kind)[number : number + 1]
     named = objects[0].get("name") if objects else None
     return str(named or f"{'node' if kind == 'nodes' else 'mesh'} {number}")
 
 
 def human_bones(document: GltfDocument) -> dict[int, str]:
-    """Return what the nodes of a VRM avatar are, as "leftUpperArm", whatever they are called.
+    """Return the humanoid bones of a VRM avatar, such as "leftUpperArm", by node.
 
-    By the extensions VRMC_vrm 1.0, VRM 0.x and, of animations, VRMC_vrm_animation; what they do not
-    say as specified is left out.
+    Reads the extensions VRMC_vrm 1.0, VRM 0.x and, for animations, VRMC_vrm_animation; invalid
+    entries are ignored.
     """
     for name in ("VRMC_vrm", "VRM", "VRMC_vrm_animation"):
         bones = inner(extension_of(document.description, name), "humanoid").get("humanBones")
@@ -235,17 +235,17 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 _LIGHT = "KHR_lights_punctual"
 _UP = np.array([0.0, 1.0, 0.0])
-"""By the standard."""
+"""Defined by the standard."""
 
 
 class Nodes(NamedTuple):
-    """The n nodes of a file, without what they show.
+    """The n nodes of a file, without their meshes.
 
     Attributes
     ----------
     parents : (n,) int64 array, -1 for a root
-    order : of the nodes, parents first
-    local, rest : (n, 4, 4) transforms as stored, and global ones
+    order : the nodes, parents first
+    local, rest : (n, 4, 4) local and global transforms
     """
 
     parents: npt.NDArray[np.int64]
@@ -255,7 +255,7 @@ class Nodes(NamedTuple):
 
 
 def read_nodes(document: GltfDocument) -> Scene:
-    """Read the nodes of a glTF file and the clips that move them, whether they show a mesh or not.
+    """Read the nodes of a glTF file and the clips that move them, with or without meshes.
 
     Raises
     ------
@@ -337,8 +337,8 @@ def _shown_primitives(
 ) -> tuple[list[Primitive], tuple[str, ...]]:
     """Return the primitives with triangles that the default scene shows, and notes on others.
 
-    They are in the order of the meshes, for each mesh of the nodes that show it, and for each node
-    of its primitives: the order of a character's vertices.
+    They are ordered by mesh, then by the node that shows it, then by primitive: the order of a
+    character's vertices.
     """
     meshes = document.objects("meshes")
     left_out, notes = left_out_nodes(document, parents)
@@ -387,7 +387,7 @@ def _parents(nodes: list[dict[str, Any]]) -> npt.NDArray[np.int64]:
 
 
 def _visible(document: GltfDocument, parents: npt.NDArray[np.int64]) -> set[int]:
-    """Return the nodes of the default scene; all where the file has no scene."""
+    """Return the nodes of the default scene; all if the file has no scene."""
     scenes = document.objects("scenes")
     if not scenes:
         return set(range(len(parents)))
@@ -418,7 +418,7 @@ def _part(document: GltfDocument, shown: Primitive, rest: FloatArray, looks: Glt
         bone_of, weights = _influences(document, attributes, where, n, len(bones))
     faces = _faces(document, primitive, where, n)
     morphs = _morphs(document, primitive, where, n)
-    # Mirrored triangles are wound the other way.
+    # Mirrored triangles have opposite winding.
     turned = faces[:, [0, 2, 1]]
     placed = None if is_skinned else instances(document, shown.node)
     if placed is None:
@@ -477,11 +477,11 @@ def _faces(
         if mode == _FAN:
             picked = np.stack([step + 1, step + 2, np.zeros_like(step)], axis=1)
         else:
-            # Every second triangle of a strip is wound the other way.
+            # Every second triangle of a strip has opposite winding.
             odd = step % 2
             picked = np.stack([step, step + 1 + odd, step + 2 - odd], axis=1)
         faces = corners[picked]
-        # Strips are joined by triangles without area.
+        # Degenerate triangles join strips.
         faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     else:
         if len(corners) % 3:
@@ -511,7 +511,7 @@ def _skin(document: GltfDocument, index: object) -> tuple[npt.NDArray[np.int64],
     stored = document.array(skin["inverseBindMatrices"], what, ("MAT4",))
     if len(stored) < len(bones):
         raise MeshFileError(f"have {len(stored)} values, {len(bones)} are needed", where=what)
-    # Column by column.
+    # Column-major.
     bind = as_float(stored[: len(bones)].reshape(-1, 4, 4).transpose(0, 2, 1))
     bind[:, 3] = 0.0, 0.0, 0.0, 1.0
     require_finite(bind, what)
@@ -521,7 +521,7 @@ def _skin(document: GltfDocument, index: object) -> tuple[npt.NDArray[np.int64],
 def _influences(
     document: GltfDocument, attributes: dict[str, Any], where: str, n: int, n_bones: int
 ) -> tuple[npt.NDArray[np.int32], FloatArray]:
-    """Return the bones and the weights of n vertices, from all sets of four that are there."""
+    """Return the bones and weights of n vertices, from all sets of four in the file."""
     joints: list[npt.NDArray[np.int64]] = []
     weights: list[FloatArray] = []
     while f"JOINTS_{len(joints)}" in attributes:
@@ -539,7 +539,7 @@ def _influences(
     bone_of, shares = np.concatenate(joints, axis=1), np.concatenate(weights, axis=1)
     require_finite(shares, f"the weights of {where}")
     shares = np.maximum(shares, 0.0)
-    # A joint without weight may be any number.
+    # A joint without weight may have any number.
     bone_of[shares == 0.0] = 0
     wrong = np.flatnonzero((bone_of >= n_bones).any(axis=1))
     if len(wrong):
@@ -548,12 +548,12 @@ def _influences(
             where=f"vertex {wrong[0]} of {where}",
             expected=f"0 to {n_bones - 1}",
         )
-    # Sorted, so that equal shares in another order have the same sum to the bit.
+    # Sort by bone, so that equal weights in another order have exactly the same sum.
     order = np.argsort(np.where(shares > 0.0, bone_of, n_bones), axis=1, kind="stable")
     bone_of = np.take_along_axis(bone_of, order, axis=1)
     shares = np.take_along_axis(shares, order, axis=1)
     total = shares.sum(axis=1)
-    # What nothing moves follows the first joint.
+    # Vertices without weights follow the first joint.
     shares[total == 0.0, 0] = 1.0
     total[total == 0.0] = 1.0
     return bone_of.astype(np.int32), shares / total[:, None]
@@ -573,7 +573,7 @@ def _morphs(
 
 
 def _sliders(document: GltfDocument, shown: Primitive, n: int) -> dict[str, FloatArray]:
-    """Return `Part.sliders`: the expressions of a VRM avatar, then each of the n targets."""
+    """Return `Part.sliders`: expressions of a VRM avatar, then the n morph targets."""
     if not n:
         return {}
     mesh, node = document.objects("meshes")[shown.mesh], document.objects("nodes")[shown.node]
@@ -589,7 +589,7 @@ def _sliders(document: GltfDocument, shown: Primitive, n: int) -> dict[str, Floa
 
 
 def _expressions(document: GltfDocument, shown: Primitive, n: int) -> dict[str, FloatArray]:
-    """Return what the expressions of VRM 1.0 or 0.x add to the weights of a mesh's n targets."""
+    """Return the weights that expressions of VRM 1.0 or 0.x add to a mesh's n morph targets."""
     vrm, old = (extension_of(document.description, name) for name in ("VRMC_vrm", "VRM"))
     found: dict[str, FloatArray] = {}
     kinds = (inner(inner(vrm, "expressions"), kind) for kind in ("preset", "custom"))
@@ -616,7 +616,7 @@ def _expressions(document: GltfDocument, shown: Primitive, n: int) -> dict[str, 
 
 
 def _default_weights(document: GltfDocument, shown: Primitive, part: Part) -> FloatArray:
-    """Return the (M,) weights of the morph targets that the file stores for a node's mesh."""
+    """Return the (M,) morph target weights that the file stores for a node's mesh."""
     mesh = document.objects("meshes")[shown.mesh]
     stored = document.objects("nodes")[shown.node].get("weights") or mesh.get("weights")
     n = len(part.morphs)

@@ -1,4 +1,4 @@
-"""A glTF 2.0 file, as .glb, .gltf or .vrm, from reading it to writing it with changes."""
+"""A glTF 2.0 file (.glb, .gltf or .vrm), to be read, edited and written."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes.topology import FloatArray
 
 VERTEX_DATA, INDICES = 34962, 34963
-"""Targets of buffer views: for numbers of the vertices of a mesh, and for its faces."""
+"""Targets of buffer views: for attributes of vertices, and for faces."""
 
 _GLB_MAGIC = b"glTF"
 _MOST_BYTES = (1 << 32) - 1
@@ -38,7 +38,7 @@ _TYPES = {width: name for name, width in _N_COMPONENTS.items()}
 DRACO = "KHR_draco_mesh_compression"
 MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 COMPRESSIONS = {DRACO, *MESHOPT}
-"""What compresses meshes; `packed` unpacks them."""
+"""Extensions that compress meshes; `packed` unpacks them."""
 
 _STRUCTURE: dict[str, Any] = {
     "extensions": {},
@@ -59,7 +59,7 @@ _STRUCTURE: dict[str, Any] = {
     "scenes": [{"nodes": [int]}],
     "skins": [{"joints": [int]}],
 }
-"""What is read of a description: objects by their keys, and lists of one kind."""
+"""The parts of a description that are read: objects by key, and lists of one type."""
 
 _KINDS = {dict: "object", str: "text", int: "whole number", float: "number"}
 
@@ -70,35 +70,35 @@ _CHANGED = ("nodes", "meshes", "scenes", "images", "extensions")
 """Parts of a description that an editable copy may change in any way."""
 
 _LARGEST = 1e100
-"""Largest number of the description; products of a few are finite."""
+"""Largest number in a description, so that products of a few are finite."""
 
 T = TypeVar("T")
 _Bytes: TypeAlias = bytes | memoryview
 
 
 class GltfDocument:
-    """A parsed glTF file whose arrays are read when they are asked for.
+    """A parsed glTF file whose arrays are read on demand.
 
     Parameters
     ----------
-    data : the file's bytes
-    path : where it is; buffers may lie beside it
+    data : bytes of the file
+    path : its path, beside which buffers may lie
 
     Attributes
     ----------
     path : as given
-    sha256 : of `data`
-    description : the file's JSON, whose objects and lists are where glTF has them; single values
-        are unchecked, and a null is none
+    sha256 : hash of `data`
+    description : the file's JSON, in which the types of objects and lists have been checked, single
+        values have not, and nulls are removed
     notes : sentences on what an editable copy lacks
 
     Raises
     ------
-    MeshFileError : it is truncated, or no glTF.
+    MeshFileError : the file is truncated or not glTF.
     """
 
     def __init__(self, data: bytes, path: Path) -> None:
-        # Before a mark the text would not begin with its brace.
+        # Remove a byte order mark.
         text, self._blob = _chunks(data.removeprefix(b"\xef\xbb\xbf"))
         self.path = path
         self.sha256 = hashlib.sha256(data).digest()
@@ -106,7 +106,7 @@ class GltfDocument:
         self._buffers: dict[int, _Bytes] = {}
         self._left = MAX_NUMBERS
         self.description = _parsed(text)
-        # Of an editable copy, the data in the order in which it is written.
+        # In an editable copy, the data in the order in which they are written.
         self._pieces: list[_Bytes] = []
 
     @property
@@ -115,13 +115,13 @@ class GltfDocument:
         return any("skin" in node and "mesh" in node for node in self.objects("nodes"))
 
     def editable(self) -> GltfDocument:
-        """Return a copy to be written as GLB: all its data, and images beside it, are one buffer.
+        """Return a copy to write as GLB, with all data, and images beside the file, in one buffer.
 
-        Arrays are read from the original alone. An image that is missing stays named as it was.
+        Read arrays from the original only. A missing image keeps its reference.
 
         Raises
         ------
-        MeshFileError : the file is damaged where reading it does not look.
+        MeshFileError : the file is damaged, possibly in parts that reading ignores.
         """
         other = self.copy()
         description = other.description
@@ -146,13 +146,13 @@ class GltfDocument:
         return other
 
     def copy(self) -> GltfDocument:
-        """Return the same, to be changed on its own.
+        """Return a copy that can be changed independently.
 
-        In any way are its nodes, meshes, scenes and extensions, of its other lists only which
-        objects are in them.
+        Its nodes, meshes, scenes, images and extensions may be changed in any way; in other lists,
+        objects may be added, removed or replaced, but not changed.
         """
         other = copy(self)
-        # As deeply as it is changed: most of a file may be its animations.
+        # Deep copies only where needed: animations may be most of a file.
         other.description = {
             name: deepcopy(entry) if name in _CHANGED else copy(entry)
             for name, entry in self.description.items()
@@ -165,7 +165,7 @@ class GltfDocument:
 
         Raises
         ------
-        MeshFileError : it has not the structure of glTF.
+        MeshFileError : it does not have the structure of glTF.
         """
         _remove_nulls(description)
         _require_kind(description, _STRUCTURE, "")
@@ -174,7 +174,7 @@ class GltfDocument:
         return other
 
     def objects(self, kind: str) -> list[dict[str, Any]]:
-        """Return a list of the description, such as "nodes"; empty where the file has none."""
+        """Return a list of the description, such as "nodes"; empty if the file has none."""
         objects: list[dict[str, Any]] = self.description.get(kind, [])
         return objects
 
@@ -191,15 +191,15 @@ class GltfDocument:
 
         Parameters
         ----------
-        index : its number in the file
-        what : as in "the positions of mesh 3"
-        types : which of "SCALAR", "VEC3" ... it may have
-        count : how many elements it must have
-        again : whether it was read before for the same, and is counted in `MAX_NUMBERS`
+        index : its index in the file
+        what : name in error messages, such as "the positions of mesh 3"
+        types : allowed types, such as "SCALAR" or "VEC3"
+        count : required number of elements
+        again : whether it was read before, and so is already counted towards `MAX_NUMBERS`
 
         Returns
         -------
-        (n, k) array in the type of the file; normalised integers are float64 numbers up to 1
+        (n, k) array in the type of the file; normalised integers become float64 up to 1
 
         Raises
         ------
@@ -232,7 +232,7 @@ class GltfDocument:
     def _with_sparse(
         self, values: npt.NDArray[Any], sparse: dict[str, Any], what: str
     ) -> npt.NDArray[Any]:
-        """Put the values that an accessor stores apart into their places."""
+        """Insert the sparse values of an accessor."""
         n = whole(sparse.get("count"), f"the sparse count of {what}", 0, len(values))
         if not sparse.keys() >= {"indices", "values"}:
             raise MeshFileError("lack their sparse indices or values", where=what)
@@ -246,7 +246,7 @@ class GltfDocument:
     def _view(
         self, stored: dict[str, Any], what: str, n: int, width: int, dtype: np.dtype[Any]
     ) -> npt.NDArray[Any]:
-        """Return (n, width) numbers of the buffer view that an object names, nothing copied."""
+        """Return (n, width) numbers of the buffer view of an object, without copying."""
         view = element(
             self.objects("bufferViews"), stored.get("bufferView"), f"buffer view of {what}"
         )
@@ -267,12 +267,12 @@ class GltfDocument:
         return np.ndarray((n, width), dtype, buffer if n else b"", at, strides)
 
     def has_buffer(self, index: object) -> bool:
-        """Whether there are bytes of a buffer: one of none stands for compressed data."""
+        """Whether a buffer has bytes; one without stands for compressed data."""
         found = element(self.objects("buffers"), index, "the buffer")
         return "uri" in found or index in self._buffers or (index == 0 and self._blob is not None)
 
     def add_unpacked(self, data: bytes) -> int:
-        """Add a buffer of what was compressed in the file, and return its number."""
+        """Add a buffer of uncompressed data, and return its index."""
         buffers = self.description.setdefault("buffers", [])
         self._buffers[len(buffers)] = data
         buffers.append({"byteLength": len(data)})
@@ -283,8 +283,8 @@ class GltfDocument:
 
         Parameters
         ----------
-        index : its number in the file
-        what : what is in it, as in "the positions of mesh 3"
+        index : its index in the file
+        what : its content for error messages, such as "the positions of mesh 3"
 
         Raises
         ------
@@ -304,7 +304,7 @@ class GltfDocument:
         return self._buffers[number]
 
     def bytes_of(self, stored: dict[str, Any], what: str) -> bytes:
-        """Return the bytes that an object names as a buffer view does; it raises as `buffer`."""
+        """Return the bytes of an object with the fields of a buffer view; raises as `buffer`."""
         buffer = self.buffer(stored.get("buffer"), what)
         start = whole(stored.get("byteOffset", 0), f"the offset of {what}", 0, len(buffer))
         most = len(buffer) - start
@@ -312,12 +312,12 @@ class GltfDocument:
         return bytes(buffer[start : start + length])
 
     def image(self, described: dict[str, Any], what: str) -> bytes:
-        """Return the file of an image, which is in this one or beside it.
+        """Return the bytes of an image file, which is in this file or beside it.
 
         Parameters
         ----------
-        described : the image
-        what : as in "image 3"
+        described : description of the image
+        what : name in error messages, such as "image 3"
 
         Raises
         ------
@@ -337,7 +337,7 @@ class GltfDocument:
         try:
             content = resource(uri, self.path, MAX_FILE_BYTES - self._size)
         except MeshFileError:
-            # Missing beside the source, or elsewhere: it is no more missing afterwards.
+            # It is missing beside the source already.
             content = b""
         media_type = _media_type(content)
         if media_type is None:
@@ -348,7 +348,7 @@ class GltfDocument:
         image["mimeType"] = media_type
 
     def add_image(self, content: bytes) -> int | None:
-        """Add to an editable document the file of an image; None for a format of no glTF file."""
+        """Add an image file to an editable document; return None if its format is not allowed."""
         media_type = _media_type(content)
         if media_type not in _OF_ANY_READER:
             return None
@@ -374,18 +374,18 @@ class GltfDocument:
     def add_array(
         self, values: npt.NDArray[Any], *, has_bounds: bool = False, target: int | None = None
     ) -> int:
-        """Add to an editable document an accessor of (n, k) numbers, k from 1 to 4, or 16.
+        """Add an accessor of (n, k) numbers to an editable document, k from 1 to 4, or 16.
 
         Parameters
         ----------
-        values : unsigned integers of 1, 2 or 4 bytes as they are, all else as float32; 16 are a
-            matrix, column by column
-        has_bounds : whether it says its least and greatest numbers, as positions and times have to
-        target : `VERTEX_DATA` for what the vertices of a mesh have, `INDICES` for its faces
+        values : unsigned integers of 1, 2 or 4 bytes keep their type, all else is stored as
+            float32; 16 numbers are a column-major matrix
+        has_bounds : whether to store the minimum and maximum, as required for positions and times
+        target : `VERTEX_DATA` for attributes of vertices, `INDICES` for faces
 
         Returns
         -------
-        its number
+        its index
         """
         dtype = values.dtype.newbyteorder("<") if values.dtype.kind == "u" else np.dtype("<f4")
         stored = values.astype(dtype)
@@ -404,9 +404,9 @@ class GltfDocument:
         return len(accessors) - 1
 
     def digest(self, key: str) -> str:
-        """Return 64 hexadecimal digits of all but the entry `key` of the extras of its asset.
+        """Return the SHA-256 of everything but the entry `key` of the asset's extras, in hex.
 
-        They are those of an editable document, and of the file that was written of it.
+        It is equal for an editable document and the file written from it.
         """
         asset = self.description["asset"]
         extras = {name: value for name, value in asset["extras"].items() if name != key}
@@ -421,7 +421,7 @@ class GltfDocument:
 
         Raises
         ------
-        MeshFileError : it is larger than GLB files can be.
+        MeshFileError : it is too large for a GLB file.
         """
         n_bytes = self._size
         first = self.description.get("buffers", [{}])[0]
@@ -447,13 +447,13 @@ def _of_version_1() -> MeshFileError:
 
 
 def as_float(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """Return numbers of a file as float64; a NaN of any kind is none to warn of."""
+    """Return numbers of a file as float64, without warnings about NaN."""
     with np.errstate(invalid="ignore"):
         return values.astype(np.float64)
 
 
 def element(items: Sequence[T] | None, index: object, what: str) -> T:
-    """Return one of a list of the file, or raise `MeshFileError` where it has none such."""
+    """Return an element of a list of the file, or raise `MeshFileError` if it does not exist."""
     n = len(items or ())
     if items is None or type(index) is not int or not 0 <= index < n:
         raise MeshFileError(f"names {what} {quoted(index)}, there are {n}", where="it")
@@ -461,14 +461,14 @@ def element(items: Sequence[T] | None, index: object, what: str) -> T:
 
 
 def whole(value: object, what: str, low: int, high: int) -> int:
-    """Return a whole number of the file, or raise `MeshFileError` where it is out of range."""
+    """Return an integer of the file, or raise `MeshFileError` if it is out of range."""
     if type(value) is not int or not low <= value <= high:
         raise MeshFileError.must_be(what, f"a whole number from {low} to {high}", quoted(value))
     return value
 
 
 def numbers(values: object, what: str, count: int) -> npt.NDArray[np.float64]:
-    """Return a list of finite numbers of the file, or raise `MeshFileError`."""
+    """Return `count` finite numbers of the file as an array, or raise `MeshFileError`."""
     try:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -479,18 +479,18 @@ def numbers(values: object, what: str, count: int) -> npt.NDArray[np.float64]:
 
 
 def require_finite(values: npt.NDArray[Any], what: str) -> None:
-    """Raise `MeshFileError` where a number of an array is not finite."""
+    """Raise `MeshFileError` if a number of an array is not finite."""
     if not np.isfinite(values).all():
         raise MeshFileError("are not all finite", where=what)
 
 
 def extension_of(holder: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return an extension of an object; empty where it has none."""
+    """Return an extension of an object; empty if it has none."""
     return inner(inner(holder, "extensions"), name)
 
 
 def inner(holder: dict[str, Any], key: str) -> dict[str, Any]:
-    """Return an object in another one; empty where there is none."""
+    """Return an object in another one; empty if there is none."""
     value = holder.get(key)
     return value if isinstance(value, dict) else {}
 
@@ -500,14 +500,14 @@ def _media_type(content: bytes) -> str | None:
 
 
 def component_dtype(code: object, what: str) -> np.dtype[Any]:
-    """Return the type of an accessor's numbers, of `componentType`."""
+    """Return the dtype for a `componentType`."""
     if type(code) is not int or code not in _DTYPES:
         raise MeshFileError.must_be(f"the type of {what}", "a number of glTF", quoted(code))
     return np.dtype(_DTYPES[code])
 
 
 def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
-    """Return the text and the binary part of a file, which is not copied."""
+    """Return the text and the binary chunk of a file, the latter without copying."""
     if not data.startswith(_GLB_MAGIC):
         return data, None
     if data[4:8] == b"\1\0\0\0":
@@ -526,7 +526,7 @@ def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
 
 
 def _parsed(text: bytes) -> dict[str, Any]:
-    """Return a description with the structure of glTF."""
+    """Parse a description and check that it has the structure of glTF."""
     try:
         values = parse_json(text)
     except ValueError as error:
@@ -542,7 +542,7 @@ def _parsed(text: bytes) -> dict[str, Any]:
 
 
 def _remove_nulls(values: Any) -> None:
-    """Remove the keys of a description whose value is null: they say nothing."""
+    """Remove the keys of a description whose value is null."""
     left = [values]
     while left:
         one = left.pop()
@@ -555,7 +555,7 @@ def _remove_nulls(values: Any) -> None:
 
 
 def _require_kind(value: Any, kind: Any, where: str) -> None:
-    """Refuse a value of a description that is of another kind than `_STRUCTURE` says."""
+    """Refuse a value of a description whose type differs from `_STRUCTURE`."""
     if isinstance(kind, list):
         (each,) = kind
         of = type(each) if isinstance(each, dict) else each
@@ -573,7 +573,7 @@ def _require_kind(value: Any, kind: Any, where: str) -> None:
 
 
 def resource(uri: object, path: Path, most_bytes: int, what: str = "its buffer") -> bytes:
-    """Read a data URI, or a regular file in the folder of the scene or below it."""
+    """Read a data URI, or a regular file in or below the folder of the scene."""
     if not isinstance(uri, str):
         raise MeshFileError.must_be(f"the URI of {what}", "a string", quoted(uri))
     try:
@@ -583,7 +583,7 @@ def resource(uri: object, path: Path, most_bytes: int, what: str = "its buffer")
                 raise ValueError("it is not base64 data")
             return base64.b64decode(content, validate=True)
         name = unquote(uri)
-        # Other drives, and addresses, which some systems would look for on the network.
+        # Other drives and network addresses.
         if name.startswith("/") or "\\" in name or ":" in name:
             raise ValueError("it is not beside the file")
         folder = path.parent.resolve()
@@ -597,7 +597,7 @@ def resource(uri: object, path: Path, most_bytes: int, what: str = "its buffer")
 
 
 def _require_complete(document: GltfDocument) -> None:
-    """Refuse what reading passes over and writing needs.
+    """Refuse defects that reading tolerates but writing does not.
 
     Raises
     ------
@@ -615,7 +615,7 @@ def _require_complete(document: GltfDocument) -> None:
 
 
 def _without_compression(description: dict[str, Any]) -> None:
-    """Remove compressed copies of what a description holds plainly, before that is changed."""
+    """Remove compressed copies of data that a description also has uncompressed."""
     for holder in (description, *description.get("meshes", ())):
         for kind in ("bufferViews", "buffers", "primitives"):
             if kind in holder:
@@ -640,7 +640,7 @@ PARTS: dict[str, tuple[float, ...]] = {
     "rotation": (0.0, 0.0, 0.0, 1.0),
     "scale": (1.0, 1.0, 1.0),
 }
-"""What the transform of a node consists of, and each where the file does not say it."""
+"""The parts of a node's transform, with their default values."""
 
 
 def stored_parts(
@@ -650,7 +650,7 @@ def stored_parts(
 
     Raises
     ------
-    MeshFileError : one of them is damaged; `where` says what the node is called.
+    MeshFileError : one of them is damaged; the message calls the node `where`.
     """
     if "matrix" in node:
         return decompose(local_transform(node, where))
@@ -662,10 +662,10 @@ def stored_parts(
 
 
 def local_transform(node: dict[str, Any], where: str = "a node") -> FloatArray:
-    """Return the (4, 4) local transform of a node of a file; it raises as `stored_parts` does."""
+    """Return the (4, 4) local transform of a node of a file; raises as `stored_parts` does."""
     if "matrix" not in node:
         return compose(*stored_parts(node, where))
-    # Column by column.
+    # Column-major.
     matrix = numbers(node["matrix"], f"the matrix of {where}", 16).reshape(4, 4).T
     matrix[3] = 0.0, 0.0, 0.0, 1.0
     return matrix

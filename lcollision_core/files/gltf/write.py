@@ -1,4 +1,4 @@
-"""A mesh, or a scene of a format that is not written, as a glTF file."""
+"""Write a mesh, or a scene read from another format, as glTF."""
 
 from __future__ import annotations
 
@@ -55,25 +55,26 @@ IntArray = npt.NDArray[np.int64]
 _WRAPS = {Wrap.REPEAT: 10497, Wrap.MIRROR: 33648, Wrap.CLAMP: 33071}
 
 _SHEAR = 1e-6
-"""Of the largest number of a node's local matrix: what a turn and a scale miss of it."""
+"""Largest shear of a node's local matrix, relative to its largest entry, that is ignored."""
 
 _STILL = 1e-9
-"""Of the size of a scene, or of a turn or a scale: what moves less is rounding."""
+"""Largest change, relative to the size of the scene, a rotation or a scale, that is rounding
+error."""
 
 _MOST_SHORT = 1 << 16
-"""Vertices and joints from which their numbers need more than two bytes."""
+"""Number of vertices from which indices need more than two bytes."""
 
 
 @dataclass(frozen=True, eq=False)
 class MadeGltf:
-    """A glTF file that was made of a scene.
+    """A glTF file made from a scene.
 
     Attributes
     ----------
-    data : the file, as GLB
-    vertices : (W,) int64 array, for each vertex of the file, as its scene has them, the vertex of
-        the first scene's parts that it is
-    delays : seconds by which each clip begins later, as glTF has no time before 0
+    data : the file as GLB
+    vertices : (W,) int64 array, the vertex of the original scene's parts for each vertex of the
+        file, in the order in which the file is read
+    delays : seconds by which each clip begins later, as glTF has no negative times
     notes : sentences on what could not be kept
     """
 
@@ -84,18 +85,18 @@ class MadeGltf:
 
 
 def gltf_of(scene: Scene, place: FloatArray, name: str, path: Path) -> MadeGltf:
-    """Make a glTF file of a scene: all its nodes with their numbers, parts, skins and clips.
+    """Make a glTF file of a scene with all its nodes, in the same order, parts, skins and clips.
 
-    Points keep their order, but where materials, texture coordinates or normals split them. Clips
-    get linear keys at their rate. A node whose parent stretches it unevenly, which glTF cannot
-    write, hangs on the root instead, and moves as it did.
+    Points keep their order, except where materials, texture coordinates or normals split them.
+    Clips get linear keys at their rate. A node that its parent would shear, which glTF cannot
+    store, is moved to the root, where it moves as before.
 
     Parameters
     ----------
-    scene : of any format
-    place : (4, 4) similarity, from the scene's coordinates to metres with y up
-    name : of a root that has none
-    path : of the scene's file
+    scene : from any format
+    place : (4, 4) similarity from the scene's coordinates to metres with y up
+    name : name for roots that have none
+    path : path of the scene's file
 
     Raises
     ------
@@ -115,7 +116,7 @@ class _Maker:
         self._materials: dict[tuple[Any, ...], int] = {}
         self._textures: dict[int, int] = {}
         self._times: dict[str, FloatArray] = {}
-        # The rest pose, then each clip: what the nodes have, and as turns and scales hold it.
+        # The rest pose, then each clip: wanted transforms, and those that glTF can store.
         self._poses = [scene.rest]
         for clip in scene.clips:
             times, poses = sample_clip(scene, clip.name, clip.rate)
@@ -150,9 +151,9 @@ class _Maker:
         return MadeGltf(data, np.concatenate(vertices), delays, notes)
 
     def _hang(self, node: int) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-        """Return a node's translations, turns and scales in each pose, below what carries it best.
+        """Return a node's translations, rotations and scales in each pose, below the best parent.
 
-        Its ancestors come first.
+        Call it for ancestors first.
         """
         parent = int(self._parents[node])
         transform, missed = self._below(node, parent)
@@ -174,7 +175,7 @@ class _Maker:
     def _below(
         self, node: int, parent: int
     ) -> tuple[list[tuple[FloatArray, FloatArray, FloatArray]], float]:
-        """Return what turns and scales hold of a node below another, and what they miss of it."""
+        """Return a node's transform parts below `parent`, and the shear that they lose."""
         transforms, missed = [], 0.0
         for wanted, placed in zip(self._wanted, self._placed, strict=True):
             above = self._above(placed, parent)
@@ -211,7 +212,7 @@ class _Maker:
         return nodes
 
     def _add_part(self, number: int, part: Part) -> IntArray:
-        """Add the mesh of a part, and return of its vertices in the file which ones they are."""
+        """Add the mesh of a part, and return the part's vertex for each one in the file."""
         look = _ordered(_look(part), len(part.points))
         self._notes += look.notes
         node = self._file.description["nodes"][part.node]
@@ -223,7 +224,7 @@ class _Maker:
         rest = self._placed[0][0]
         faces = look.faces
         if is_mirrored(rest[bones] @ bind, bone_of, part.weights):
-            # Readers turn them.
+            # Readers flip them.
             faces = faces[:, [0, 2, 1]]
         attributes = {
             "POSITION": self._vectors(
@@ -266,7 +267,7 @@ class _Maker:
     def _primitives(
         self, part: Part, look: Appearance, faces: IntArray, attributes: dict[str, int]
     ) -> list[dict[str, Any]]:
-        """Return the faces of each material, on common vertices, so that these keep their order."""
+        """Return a primitive for each material, all on the same vertices to keep their order."""
         kinds, kind_of = np.unique(
             np.stack([part.material_of, look.material_of], axis=1), axis=0, return_inverse=True
         )
@@ -291,7 +292,7 @@ class _Maker:
         return primitives
 
     def _influences(self, part: Part, vertices: IntArray) -> dict[str, int]:
-        """Return joints and weights of vertices in sets of four, the strongest in the first."""
+        """Return joints and weights of vertices in sets of four, strongest first."""
         strongest = np.argsort(-part.weights, axis=1, kind="stable")
         width = -(-max(int((part.weights > 0.0).sum(axis=1).max()), 1) // 4) * 4
         weights, joints = np.zeros((2, len(part.points), width))
@@ -355,7 +356,7 @@ class _Maker:
                     signs = signs_on_one_side(np.concatenate([rest, values]))
                     values = signs[1:, None] * values
                 unit = size if path == "translation" else float(np.abs(values).max())
-                # What a clip moves is a joint for readers, though it stay where it is.
+                # Readers take a node that a clip moves for a joint, even if it stays in place.
                 is_named = path == "translation" and node in moved
                 if is_named or np.abs(values - rest).max() > _STILL * unit:
                     add(node, path, values)
@@ -364,7 +365,7 @@ class _Maker:
             if values.size and (values != rest).any():
                 add(part.node, "weights", values.reshape(-1, 1))
         if not channels:
-            # A clip has one at least.
+            # A clip needs at least one channel.
             add(0, "translation", self._tracks[0][number][0])
         return {"name": name, "channels": channels, "samplers": samplers}
 
@@ -388,7 +389,7 @@ def _look(part: Part) -> Appearance:
 
 
 def _ordered(look: Appearance, n_vertices: int) -> Appearance:
-    """Return a look whose points are in the order of all n vertices, also of those of no face."""
+    """Return an appearance with points in the order of all vertices, including unused ones."""
     unused = np.setdiff1d(np.arange(n_vertices), look.vertices)
     vertices = np.concatenate([look.vertices, unused])
     order = np.argsort(vertices, kind="stable")

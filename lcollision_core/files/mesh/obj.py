@@ -1,10 +1,7 @@
-"""Wavefront OBJ, read, written, and written again with other positions.
+"""Wavefront OBJ: read it, write it, and rewrite a file with other positions.
 
-An own reader, because the vertex order and count must survive: trimesh splits a vertex where its
-texture coordinates or normals differ.
-
-An own reader, because the vertex order and count must survive: trimesh splits a vertex where its
-texture coordinates or normals differ.
+It has its own reader because the vertex order and count must be kept: trimesh splits a vertex where
+its texture coordinates or normals differ.
 """
 
 from __future__ import annotations
@@ -40,7 +37,7 @@ _NORMAL_OF_CORNER = re.compile(rb"[^\s/]+(?:/[^\s/]*)?(?:/([^\s/]*))?")
 
 
 def read(file: BinaryIO, _: object = None) -> Polygons:
-    """Read `v` and `f` lines; texture coordinates, normals, groups and materials are passed over.
+    """Read `v` and `f` lines; texture coordinates, normals, groups and materials are ignored.
 
     Parameters
     ----------
@@ -52,7 +49,7 @@ def read(file: BinaryIO, _: object = None) -> Polygons:
 
     Raises
     ------
-    MeshFileError : a vertex or face is not readable, named by its number from 0.
+    MeshFileError : a vertex or face cannot be read; the message gives its number from 0.
     """
     lines = _Lines.of(read_rest(file))
     return Polygons(lines.points("v"), *lines.faces())
@@ -66,9 +63,9 @@ class ObjCorners:
     ----------
     vertices : (V, 3) float64 array
     normals : (N, 3) float64 array
-    sizes : (P,) int64 array, corners of each polygon
-    corners : (sum of sizes,) int64 array, vertex indices from 0
-    corner_normals : (sum of sizes,) int64 array, normal indices from 0; -1 where a corner has none
+    sizes : (P,) int64 array, number of corners of each polygon
+    corners : (sum of sizes,) int64 array of vertex indices
+    corner_normals : (sum of sizes,) int64 array of normal indices, -1 for none
     """
 
     vertices: npt.NDArray[np.float64]
@@ -83,7 +80,7 @@ def read_corners(data: bytes) -> ObjCorners:
 
     Raises
     ------
-    MeshFileError : as for `read`.
+    MeshFileError : see `read`.
     """
     lines = _Lines.of(data)
     sizes, corners = lines.faces()
@@ -95,13 +92,13 @@ def read_corners(data: bytes) -> ObjCorners:
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """The text of a file, without comments, and which lines are what.
+    """The text of a file without comments, and the kinds of its lines.
 
     Attributes
     ----------
-    text : (n,) uint8 array, the keywords replaced by blanks
-    lengths : (L,) int64 array, of the lines
-    is_kind : for each of the keywords "v", "vn" and "f" an (L,) bool array
+    text : (n,) uint8 array, with keywords replaced by blanks
+    lengths : (L,) int64 array, lengths of the lines
+    is_kind : (L,) bool arrays by keyword, "v", "vn" or "f"
     """
 
     text: npt.NDArray[np.uint8]
@@ -141,7 +138,7 @@ class _Lines:
         return _faces(self._of_kind("f"), n_before[self.is_kind["f"]])
 
     def corner_normals(self, n_normals: int) -> npt.NDArray[np.int64]:
-        """Return each corner's normal, an index from 0; -1 for none and for one out of range."""
+        """Return the index of each corner's normal; -1 if it has none or is out of range."""
         named = _NORMAL_OF_CORNER.sub(lambda corner: corner[1] or b"0", self._of_kind("f"))
         values, sizes = number_rows(named, "face", whole=True)
         index = vertex_numbers(values, sizes)
@@ -153,7 +150,7 @@ class _Lines:
 def _faces(
     text: bytes, n_before: npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return sizes and corners of `f` lines; `n_before` vertices precede each."""
+    """Return the sizes and corners of `f` lines, each preceded by `n_before` vertices."""
     if b"/" in text:
         text = re.sub(rb"(?<=[0-9])/[^\s]*", b"", text)
     values, sizes = number_rows(text, "face", whole=True)
@@ -178,16 +175,16 @@ def _faces(
 
 @dataclass(frozen=True, eq=False)
 class ObjDetail:
-    """What an OBJ file holds of triangles beside their corners.
+    """Further content of an OBJ file of triangles.
 
     Attributes
     ----------
     normals : (N, 3) array
-    normal_faces : (F, 3) array, each corner's normal, from 0
-    uv : (T, 2) array, from the lower left corner of a picture; empty for none
-    uv_faces : (F, 3) array, each corner's place in `uv`
+    normal_faces : (F, 3) array, index of each corner's normal
+    uv : (T, 2) array, from the lower left corner of the image; empty for none
+    uv_faces : (F, 3) array, index of each corner in `uv`
     groups, materials : names
-    group_of, material_of : (F,) arrays, each face's group and material by number; -1 for none
+    group_of, material_of : (F,) arrays, index of each face's group and material; -1 for none
     """
 
     normals: npt.NDArray[np.floating[Any]]
@@ -209,7 +206,7 @@ def encode(
     ----------
     vertices : (V, 3) float32 or float64 array
     faces : (F, 3) int32 array, indices from 0 (written from 1); their order is kept
-    detail : written too; None for none
+    detail : further content to write
     """
     rows = "v %s %s %s\n" * len(vertices) % decimals(vertices)
     if detail is None:
@@ -239,7 +236,7 @@ def _face_lines(line: str, named: npt.NDArray[np.integer]) -> str:
 
 
 def _one_word(name: str) -> str:
-    """Return a name without the blanks that would make several names of it."""
+    """Return a name with the characters replaced that would split it into several words."""
     return re.sub(r"[\s#\\]+", "_", name)
 
 
@@ -256,7 +253,7 @@ _THREE = re.compile(
 def rewrite_obj(
     path: str | os.PathLike[str], source: str | os.PathLike[str], vertices: npt.NDArray[Any]
 ) -> None:
-    """Write an OBJ file again, whole or not at all, with other positions: see `rewritten`.
+    """Write an OBJ file with other positions, atomically: see `rewritten`.
 
     Raises
     ------
@@ -274,25 +271,25 @@ def rewrite_obj(
 def rewritten(data: bytes, vertices: npt.NDArray[Any]) -> bytes:
     """Replace the coordinates of an OBJ file's `v` and `vn` lines.
 
-    What stands behind the coordinates, such as vertex colours, stays, and so does the text of a
-    number that does not change. A normal keeps its number and moves with the corners that use it:
-    see `moved_normals`. Programs that give faces of one direction a common normal, as Blender
-    does, leave such faces one where the pose turns them apart.
+    Text after the coordinates, such as vertex colours, stays, and so does a line whose numbers do
+    not change. A normal keeps its index and turns with the corners that use it: see
+    `moved_normals`. If a program, such as Blender, wrote one normal for faces of equal direction,
+    they still share it where the pose turns them apart.
 
     Parameters
     ----------
-    data : the bytes of an OBJ file
+    data : bytes of an OBJ file
     vertices : (V, 3) finite array, in the file's order; written with the shortest decimals that
         read back as the same numbers
 
     Returns
     -------
-    the bytes of the new file
+    bytes of the new file
 
     Raises
     ------
-    ShapeError : another shape.
-    MeshFileError : the file cannot be read.
+    ShapeError : `vertices` has the wrong shape.
+    MeshFileError : the file cannot be read, or its lines cannot be replaced.
     """
     corners = read_corners(data)
     if vertices.shape != corners.vertices.shape:

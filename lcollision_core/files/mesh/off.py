@@ -1,10 +1,7 @@
 """Object File Format (OFF), text form.
 
-An own reader, because trimesh reorders the triangles of quads, leaves out faces that end early
-without an error, and writes ten digits.
-
-An own reader, because trimesh reorders the triangles of quads, leaves out faces that end early
-without an error, and writes ten digits.
+It has its own reader because trimesh reorders the triangles of quads, drops truncated faces without
+an error, and writes ten digits.
 """
 
 from __future__ import annotations
@@ -31,7 +28,7 @@ _HEAD_BYTES = 1 << 16
 
 
 def read(file: BinaryIO, _: object = None) -> Polygons:
-    """Read the vertices and faces; colours, normals and texture coordinates are passed over.
+    """Read the vertices and faces; colours, normals and texture coordinates are ignored.
 
     Parameters
     ----------
@@ -43,7 +40,7 @@ def read(file: BinaryIO, _: object = None) -> Polygons:
 
     Raises
     ------
-    MeshFileError : the header is no OFF header, or a vertex or face is missing or not readable.
+    MeshFileError : there is no OFF header, or a vertex or face is missing or unreadable.
     """
     head = plain_lines(file.read(_HEAD_BYTES))
     n_vertices, n_faces, _ = _read_head(head)
@@ -51,7 +48,7 @@ def read(file: BinaryIO, _: object = None) -> Polygons:
     require_plausible_count(n_faces, "faces")
     file.seek(0)
     data = plain_lines(read_rest(file))
-    # The rest of the line of counts is the number of edges, which readers ignore.
+    # The line of counts ends with the number of edges, which readers ignore.
     data = re.sub(rb"\n\s+", b"\n", data[_read_head(data)[2] :]).lstrip()
     ends = np.flatnonzero(np.frombuffer(data, dtype=np.uint8) == ord("\n")) + 1
     if len(ends) < n_vertices + n_faces:
@@ -64,7 +61,7 @@ def read(file: BinaryIO, _: object = None) -> Polygons:
 
 
 def _read_head(text: bytes) -> tuple[int, int, int]:
-    """Return the counts of vertices and faces, and where the line that holds them ends."""
+    """Return the counts of vertices and faces, and the end of their line."""
     header = _HEADER.match(text)
     if header is None or b"BINARY" in header[1].upper():
         raise MeshFileError("it does not start with OFF as a text OFF file does")

@@ -1,10 +1,7 @@
 """Stanford PLY, text and binary of either byte order.
 
-An own reader, because trimesh reorders the triangles of quads, refuses binary polygons of different
-sizes, takes 1.5 for vertex 1, and writes single precision.
-
-An own reader, because trimesh reorders the triangles of quads, refuses binary polygons of different
-sizes, takes 1.5 for vertex 1, and writes single precision.
+It has its own reader because trimesh reorders the triangles of quads, refuses binary polygons of
+different sizes, accepts 1.5 as vertex 1, and writes single precision.
 """
 
 from __future__ import annotations
@@ -36,7 +33,7 @@ class _Property(NamedTuple):
     name: str
     dtype: str
     count_dtype: str | None = None
-    """The type of the count before a list; None for a single value."""
+    """Type of the count before a list; None for a single value."""
 
 
 class _Element(NamedTuple):
@@ -46,11 +43,11 @@ class _Element(NamedTuple):
 
 
 _Column = tuple[npt.NDArray[Any], npt.NDArray[np.int64] | None]
-"""All values of a property, lists joined, and the length of each row's list; None without lists."""
+"""All values of a property, lists concatenated, and the length of each list; None if single."""
 
 
 def read(file: BinaryIO, _: object = None) -> Polygons:
-    """Read the vertices' x, y, z, the faces and triangle strips; all else is passed over.
+    """Read the vertices' x, y, z, the faces and triangle strips; all else is ignored.
 
     Parameters
     ----------
@@ -62,13 +59,13 @@ def read(file: BinaryIO, _: object = None) -> Polygons:
 
     Raises
     ------
-    MeshFileError : the header is not understood, announces too much, or the body is shorter than
-        announced or not readable.
+    MeshFileError : the header is invalid or announces too much, or the body is truncated or
+        unreadable.
     """
     byte_order, elements = _read_header(file)
     data = read_rest(file)
     if byte_order is None:
-        # As text, a body is read as if it were binary and all of it double precision.
+        # Convert a text body to a binary one in double precision.
         data = number_rows(plain_lines(data), "row")[0].tobytes()
         elements = [
             element._replace(properties=[_as_double(item) for item in element.properties])
@@ -88,14 +85,14 @@ def read(file: BinaryIO, _: object = None) -> Polygons:
             continue
         columns_of = columns[element_name]
         values, sizes = next(columns_of[name] for name in _CORNER_NAMES if name in columns_of)
-        assert sizes is not None  # as the header says
+        assert sizes is not None  # checked in the header
         corners = vertex_numbers(values, sizes, element_name)
         if element_name == "tristrips":
             corners = _triangles_of_strips(corners, sizes)
             sizes = np.full(len(corners) // 3, 3)
         all_sizes.append(sizes)
         all_corners.append(corners)
-    # A signalling NaN, as damage leaves it, warns when it is cast; the reader refuses any.
+    # Casting a signalling NaN of a damaged file warns; NaNs are refused later.
     with np.errstate(invalid="ignore"):
         vertices = np.stack([x, y, z], axis=1, dtype=np.float64)
     return Polygons(
@@ -109,10 +106,10 @@ def read(file: BinaryIO, _: object = None) -> Polygons:
 def _triangles_of_strips(
     corners: npt.NDArray[np.int64], sizes: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.int64]:
-    """Return the corners of the triangles of strips, which have `sizes` corners.
+    """Return the corners of the triangles of strips with `sizes` corners.
 
-    Of a strip's triangles every second one is wound in the opposite sense; -1 begins another strip.
-    Triangles that name a vertex twice only lead from one strip to the next, and are left out.
+    Every second triangle of a strip has opposite winding; -1 begins another strip. Triangles that
+    repeat a vertex only join strips, and are left out.
     """
     places = np.arange(len(corners))
     begin = np.zeros_like(places)
@@ -214,14 +211,14 @@ class _Body:
         self._offset = 0
 
     def read(self, element: _Element) -> dict[str, _Column]:
-        """Read the next element's rows."""
+        """Read the rows of the next element."""
         if element.n_rows == 0 or not element.properties:
             return {item.name: (np.empty(0), np.empty(0, np.int64)) for item in element.properties}
         columns = self._read_table(element)
         return self._read_ragged(element) if columns is None else columns
 
     def _read_table(self, element: _Element) -> dict[str, _Column] | None:
-        """Read rows as one table; None unless every list is as long as in the first row."""
+        """Read all rows as a table; return None unless lists are as long as in the first row."""
         fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
         for item in element.properties:
             dtype = self._order + item.dtype
@@ -260,7 +257,7 @@ class _Body:
         return np.frombuffer(self._data, dtype=row, count=count, offset=self._offset)
 
     def _read_ragged(self, element: _Element) -> dict[str, _Column]:
-        """Read row by row: polygons of different sizes."""
+        """Read row by row, for polygons of different sizes."""
         data, offset = self._data, self._offset
         dtypes = [np.dtype(self._order + item.dtype) for item in element.properties]
         counts = [

@@ -1,4 +1,4 @@
-"""What every mesh format holds, the limits that every reader keeps, and polygons as triangles."""
+"""Polygons as read from mesh files, limits common to all readers, and triangulation."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.topology import Topology
 
 MAX_FACES = 5_000_000
-"""The most faces, and the most vertices, that a mesh file may hold.
+"""Most faces, and most vertices, in a mesh file.
 
-Far above any posed body, and low enough that a file at the limit fits into memory. Counts are
-compared with it before anything of that size is allocated.
+It is far above any posed body, and low enough that a file at the limit fits into memory. Counts are
+compared with it before memory is allocated.
 """
 
 MAX_FILE_BYTES = 1 << 29
-"""The largest mesh file that is read, in bytes: as text it takes some ten times that in memory."""
+"""Largest mesh file that is read, in bytes; a text file takes about ten times that in memory."""
 
 MAX_NUMBERS = 1 << 27
-"""The most numbers that are read of all arrays of a file together: 1 GiB as float64."""
+"""Most numbers that are read from all arrays of a file together: 1 GiB as float64."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +34,12 @@ class Polygons:
     Attributes
     ----------
     vertices : (V, 3) float64 array, in the file's order
-    sizes : (P,) int64 array, corners of each polygon
-    corners : (sum of sizes,) int64 array, vertex indices from 0, one polygon after the other
-    notes : sentences on what was done to the file's content
-    is_single : whether the file holds the coordinates as float32
-    cut_of : of triangles that were cut already, ascending numbers of the polygons that they were
-        cut from; None where each is one
+    sizes : (P,) int64 array, number of corners of each polygon
+    corners : (sum of sizes,) int64 array of vertex indices, one polygon after the other
+    notes : sentences on changes to the file's content
+    is_single : whether the file stores the coordinates as float32
+    cut_of : ascending indices of the original polygons, if they are triangulated already; None if
+        not
     """
 
     vertices: npt.NDArray[np.float64]
@@ -66,18 +66,18 @@ class Polygons:
 def with_order_of(
     corners: npt.NDArray[np.float64], topology: Topology | None, note: str, is_single: bool
 ) -> Polygons | None:
-    """Put the corners of triangles back into the vertex order of the mesh that they were cut from.
+    """Restore the vertex order of a mesh whose file stores the corners of triangles.
 
     Parameters
     ----------
-    corners : (3 F, 3) array, three in turn for each triangle
-    topology : of that mesh
-    note : what to say of it
-    is_single : whether the file holds them as float32
+    corners : (3 F, 3) array, three corners for each triangle
+    topology : expected topology of the mesh
+    note : note to add if the order is restored
+    is_single : whether the file stores the corners as float32
 
     Returns
     -------
-    the triangles; None where corners of one vertex of the topology differ
+    the triangles; None if they do not match the topology
     """
     if topology is None or len(corners) != 3 * topology.n_faces or len(topology.unused_vertices):
         return None
@@ -90,8 +90,8 @@ def with_order_of(
 
 
 def first_at_each_position(points: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    """Return (n,) for each of (n, 3) points the index of the first at its coordinates."""
-    # -0.0 becomes 0.0: equal coordinates, equal bits.
+    """Return, for each of (n, 3) points, the index of the first point with equal coordinates."""
+    # Adding 0.0 turns -0.0 into 0.0, so that equal coordinates have equal bits.
     bits = (np.ascontiguousarray(points, dtype=np.float64) + 0.0).view(np.uint64)
     order = np.lexsort(bits.T)
     is_new = np.ones(len(order), dtype=np.bool_)
@@ -102,7 +102,7 @@ def first_at_each_position(points: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
 
 
 def require_plausible_count(count: int, what: str) -> None:
-    """Raise `MeshFileError` when a file announces fewer than none, or more than `MAX_FACES`."""
+    """Raise `MeshFileError` if a file announces a negative count, or more than `MAX_FACES`."""
     if count < 0:
         raise MeshFileError(f"it is damaged: it announces {count} {what}")
     if count > MAX_FACES:
@@ -112,7 +112,7 @@ def require_plausible_count(count: int, what: str) -> None:
 
 
 def read_rest(file: BinaryIO) -> bytes:
-    """Read what is left of an open file, or raise `MeshFileError` above `MAX_FILE_BYTES`."""
+    """Read the rest of an open file, or raise `MeshFileError` above `MAX_FILE_BYTES`."""
     start = file.tell()
     size = file.seek(0, os.SEEK_END) - start
     if size > MAX_FILE_BYTES:
@@ -125,25 +125,25 @@ def read_rest(file: BinaryIO) -> bytes:
 
 
 _ROUNDING = 1e-6
-"""Of a polygon's area: by so much a triangle of its fan may face the other way, as decimals do."""
+"""Largest area, relative to its polygon's, of an inverted fan triangle that is rounding error."""
 
 _LEAST_AREA = 1e-12
-"""Of a polygon's squared length, as of `degenerate_faces`: below it, no side of it is known."""
+"""Least area of a polygon relative to its squared length, as in `degenerate_faces`."""
 
 _MOST_BEND = 0.5
-"""How far from its plane a polygon may reach, over the square root of its area."""
+"""Largest distance of a polygon from its plane, relative to the square root of its area."""
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float64]
 
 
 class Triangulation(NamedTuple):
-    """Triangles that were cut from polygons.
+    """The result of triangulating polygons.
 
     Attributes
     ----------
     faces : (F, 3) int64 array, in the order of the polygons
-    cut_of : (F,) int64 array, the number of each one's polygon, ascending
+    cut_of : (F,) int64 array, ascending index of each face's polygon
     notes : a sentence for each kind of polygon
     """
 
@@ -155,15 +155,15 @@ class Triangulation(NamedTuple):
 def triangulate(polygons: Polygons, topology: Topology | None = None) -> Triangulation:
     """Cut each polygon of n corners into n - 2 triangles.
 
-    Those are the fan round its first corner where that covers the polygon and nothing beside it, as
-    for every convex one; else its ears are clipped, as seen along its normal (Newell's). Where
-    neither covers it, as it crosses itself or has no area, it is the fan, and the notes say so.
+    They are the fan around its first corner if that covers exactly the polygon, as for every convex
+    one; else its ears are clipped in the plane of its normal (Newell's). If neither covers the
+    polygon, because it crosses itself or has no area, the fan is used, with a note.
 
     Parameters
     ----------
     polygons : the content of a file
-    topology : of the set that the file belongs to. Where it was cut from the same polygons, so are
-        these, so that all poses of a set have the same triangles, whatever their shapes.
+    topology : topology of the file's set. If it comes from the same polygons, they are cut in the
+        same way, so that all poses of a set have the same triangles.
 
     Raises
     ------
@@ -171,7 +171,7 @@ def triangulate(polygons: Polygons, topology: Topology | None = None) -> Triangu
 
     Notes
     -----
-    Triangles that name a vertex twice, as files of CAD and decimated scans hold, are left out.
+    Triangles that use a vertex twice, as in files of CAD and decimated scans, are left out.
     """
     sizes, corners, notes = _without_repeats(polygons.sizes, polygons.corners)
     too_small = np.flatnonzero(sizes < 3)
@@ -189,7 +189,7 @@ def triangulate(polygons: Polygons, topology: Topology | None = None) -> Triangu
             notes.append(f"{count} {name.format('s' * (count > 1))} {were} triangulated")
     polygon_of = np.repeat(np.arange(len(sizes)), sizes - 2)
     first = (np.cumsum(sizes) - sizes)[polygon_of]
-    # Each polygon before has two corners more than triangles.
+    # Each earlier polygon has two more corners than triangles.
     second = np.arange(len(first)) + 2 * polygon_of + 1
     fans = np.stack([first, second, second + 1], axis=1)
     cut_of = polygon_of if polygons.cut_of is None else polygons.cut_of
@@ -205,7 +205,7 @@ def triangulate(polygons: Polygons, topology: Topology | None = None) -> Triangu
         return Triangulation(topology.faces.astype(np.int64), cut_of, tuple(notes))
     rows = np.flatnonzero(sizes[polygon_of] > 3)
     if len(rows) and len(polygons.vertices):
-        # What is out of range or not finite is refused later, by its number.
+        # Indices out of range and coordinates that are not finite are refused later.
         points = polygons.vertices.take(corners, axis=0, mode="clip")
         with np.errstate(all="ignore"):
             fans[rows], doubtful = _cut_by_shape(points, corners, fans[rows], polygon_of[rows])
@@ -218,13 +218,13 @@ def triangulate(polygons: Polygons, topology: Topology | None = None) -> Triangu
 
 
 def _name_twice(faces: IntArray) -> npt.NDArray[np.bool_]:
-    """Return which of (F, 3) faces name a vertex twice: they have no area in any pose."""
+    """Return the mask of (F, 3) faces that use a vertex twice, and so never have area."""
     named_twice: npt.NDArray[np.bool_] = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     return named_twice
 
 
 def _left_out(polygon: IntArray) -> str:
-    """Say which polygons' triangles with two equal corners are left out."""
+    """Describe the triangles with two equal corners that are left out, by their polygons."""
     if len(polygon) == 1:
         return f"face {polygon[0]} (from 0), which has two equal corners, was left out"
     return (
@@ -236,10 +236,10 @@ def _left_out(polygon: IntArray) -> str:
 def are_of_same_polygons(
     faces: npt.NDArray[np.integer], others: npt.NDArray[np.integer], cut_of: IntArray
 ) -> bool:
-    """Whether two ways to cut polygons into triangles are of the same polygons.
+    """Whether two triangulations are of the same polygons.
 
-    They are where the triangles of each polygon have one boundary: what other edges they have,
-    they have in both directions. A triangle that was none before is to be the same as it stands.
+    They are if the triangles of each polygon have the same boundary, that is, if the directed edges
+    of both cancel. Polygons that are triangles must be equal.
 
     Parameters
     ----------
@@ -266,7 +266,7 @@ def are_of_same_polygons(
 
 
 def _without_repeats(sizes: IntArray, corners: IntArray) -> tuple[IntArray, IntArray, list[str]]:
-    """Leave out corners whose vertex the next corner names too, where three are left."""
+    """Leave out corners with the same vertex as the next one, if three corners remain."""
     ends = np.cumsum(sizes)
     filled = np.flatnonzero(sizes > 0)
     after = np.arange(1, len(corners) + 1)
@@ -289,17 +289,17 @@ def _cut_by_shape(
 
     Parameters
     ----------
-    points : (C, 3) array, the positions of the corners of all polygons
+    points : (C, 3) array, positions of the corners of all polygons
     corners : (C,) array, their vertices
-    fans : (F, 3) array, the triangles of P polygons, indices of corners
+    fans : (F, 3) array of corner indices, the fans of P polygons
     polygon_of : (F,) array, ascending
 
     Returns
     -------
-    triangles : (F, 3) array, indices of corners
-    doubtful : numbers of the polygons that have no area, are far from flat or cross themselves
+    triangles : (F, 3) array of corner indices
+    doubtful : indices of polygons that have no area, are far from flat or cross themselves
     """
-    # Below one, squares neither overflow nor vanish; a power of two rounds nothing.
+    # Scale to about 1, so that squares neither overflow nor vanish; a power of two is exact.
     points = np.ldexp(points, -int(np.frexp(np.abs(points).max())[1]))
     origin, *ends = points[fans.T]
     sides = np.stack(ends) - origin
@@ -339,7 +339,7 @@ def _cut_by_shape(
 
 
 def _doubts(polygons: IntArray) -> list[str]:
-    """Say which polygons programs cut in different ways."""
+    """Describe the polygons that programs triangulate differently."""
     if not len(polygons):
         return []
     first = f"face {polygons[0]} (from 0)"
@@ -368,10 +368,10 @@ def _is_same(points: FloatArray, a: int, b: int) -> bool:
 def _is_ear(
     points: FloatArray, before: IntArray, after: IntArray, corner: int, slack: float
 ) -> bool:
-    """Whether a corner is convex and its triangle, enlarged by `slack`, is free of other corners.
+    """Whether a corner is convex and its triangle, enlarged by `slack`, contains no other corners.
 
-    Reflex corners alone are looked for, as one of them is in any triangle that is not free. Those
-    at the same place as one of the triangle's, as at the bridge to a hole, are not in its way.
+    Only reflex corners are tested, as any triangle that is not empty contains one. Corners at the
+    same position as one of the triangle's, as at the bridge to a hole, are ignored.
     """
     a, c = before[corner], after[corner]
     if _twice_area(points, a, corner, c) <= _LEAST_AREA:
@@ -396,31 +396,31 @@ def _is_ear(
 def _clip_ears(
     points: FloatArray, starts: IntArray, sizes: IntArray
 ) -> tuple[IntArray, npt.NDArray[np.bool_]]:
-    """Clip the ears of polygons that run counterclockwise, about as large as 1.
+    """Clip the ears of counterclockwise polygons of size about 1.
 
-    As all triangles run counterclockwise too, or have no area, and the edges between them cancel,
-    each point of the plane lies in as many as the polygon winds round it: never one outside.
+    All triangles are counterclockwise too, or have no area, and their inner edges cancel. So the
+    number of triangles that cover a point is the polygon's winding number, 0 outside.
 
     Parameters
     ----------
     points : (C, 2) array, the corners of one polygon after the other
-    starts, sizes : (P,) arrays, the first corner of each polygon and the number of its corners
+    starts, sizes : (P,) arrays, first corner and number of corners of each polygon
 
     Returns
     -------
-    triangles : (C - 2 P, 3) array, indices of corners
-    is_cut : (P,) array, False where a polygon crosses itself so that there are no such triangles
+    triangles : (C - 2 P, 3) array of corner indices
+    is_cut : (P,) array, False if a polygon crosses itself so that there are no such triangles
     """
     triangles = np.zeros((len(points) - 2 * len(starts), 3), np.int64)
     is_cut = np.ones(len(starts), np.bool_)
     before, after = np.arange(-1, len(points) - 1), np.arange(1, len(points) + 1)
-    # Clipping an ear makes ears of its neighbours only.
+    # Clipping an ear can only turn its neighbours into ears.
     is_known = np.zeros(len(points), np.bool_)
     for polygon in range(len(starts)):
         corner, n_left = starts[polygon], sizes[polygon]
         before[corner], after[corner + n_left - 1] = corner + n_left - 1, corner
         row = corner - 2 * polygon
-        # Strict first; then ears that others touch; then corners in line, or at one place.
+        # First strict ears, then ears that other corners touch, then collinear or coincident ones.
         leniency, n_tried = 0, 0
         while n_left > 3 and leniency < 3:
             a, c = before[corner], after[corner]
@@ -436,7 +436,7 @@ def _clip_ears(
                 is_known[a], is_known[c] = False, False
                 row, n_left = row + 1, n_left - 1
                 leniency, n_tried = 0, 0
-                # Not its neighbour, so that no fan of slivers results.
+                # Skip the neighbour, to avoid a fan of slivers.
                 corner = after[c]
                 continue
             is_known[corner] = True

@@ -1,10 +1,7 @@
 """STL, binary and text: triangles that repeat their corners' coordinates.
 
-An own reader, because trimesh takes a text file that ends early for an empty one, and refuses a
-binary one with something after its triangles.
-
-An own reader, because trimesh takes a text file that ends early for an empty one, and refuses a
-binary one with something after its triangles.
+It has its own reader because trimesh reads a truncated text file as an empty one, and refuses a
+binary one with data after its triangles.
 """
 
 from __future__ import annotations
@@ -35,14 +32,14 @@ _REORDERED = "STL stores no shared vertices; corners were put back into the set'
 
 
 def read(file: BinaryIO, topology: Topology | None = None) -> Polygons:
-    """Read the triangles and give them shared vertices.
+    """Read the triangles and join their corners to shared vertices.
 
     Parameters
     ----------
     file : open binary file at its start
-    topology : the connectivity that the triangles are expected to have, in its order of faces.
-        When all corners that it calls one vertex agree, its vertex order is restored. Otherwise
-        vertices are numbered as they first appear, equal coordinates being one vertex.
+    topology : expected connectivity, with the same order of faces. If all corners of each of its
+        vertices agree, its vertex order is restored. Otherwise corners at equal coordinates become
+        one vertex, numbered by first appearance.
 
     Returns
     -------
@@ -50,14 +47,14 @@ def read(file: BinaryIO, topology: Topology | None = None) -> Polygons:
 
     Raises
     ------
-    MeshFileError : the file is truncated or no STL.
+    MeshFileError : the file is truncated or not STL.
     """
     size = os.fstat(file.fileno()).st_size
     head = file.read(_HEADER_BYTES)
     n_triangles = int.from_bytes(head[80:], "little") if len(head) == _HEADER_BYTES else -1
     is_text = head.lstrip()[:5].lower() == b"solid"
     expected = _HEADER_BYTES + n_triangles * _TRIANGLE.itemsize
-    # A binary file may say "solid" too, so its exact size decides first.
+    # A binary file may start with "solid" too, so check for its exact size first.
     if n_triangles >= 0 and (expected == size or (not is_text and expected < size)):
         require_plausible_count(n_triangles, "triangles")
         body = file.read(n_triangles * _TRIANGLE.itemsize)
@@ -72,7 +69,7 @@ def read(file: BinaryIO, topology: Topology | None = None) -> Polygons:
         )
     else:
         raise MeshFileError(f"it has {size} bytes, too few for an STL file")
-    # -0.0 becomes 0.0: which of equal corners is kept is arbitrary.
+    # Turn -0.0 into 0.0, as equal corners are merged.
     points = corners.reshape(-1, 3) + 0.0
     is_single = not (is_text and expected != size)
     ordered = with_order_of(points, topology, _REORDERED, is_single)

@@ -1,4 +1,4 @@
-"""Numbers as text: shortest decimals out, checked numbers in."""
+"""Write numbers as shortest decimals, and parse checked numbers from text."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def decimals(values: npt.NDArray[Any]) -> tuple[str, ...]:
 
     Returns
     -------
-    one string a number, in C order
+    one string per number, in C order
     """
     flat = values.ravel()
     return tuple(map(str, flat if flat.dtype == np.float32 else flat.tolist()))
 
 
 def plain_lines(data: bytes) -> bytes:
-    """Return text whose lines end in a newline, without byte order mark, tabs or # comments."""
+    """Normalise text: newlines only, without byte order mark, tabs or # comments."""
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if b"#" in data:
@@ -51,19 +51,19 @@ def number_rows(
     Parameters
     ----------
     text : lines that end in a newline
-    name : what a line is called in the message, such as "vertex"
-    whole : read text of digits alone as int64, where numbers beyond become its largest
+    name : name of a line in error messages, such as "vertex"
+    whole : parse text with digits only as int64, clipped to its largest number
 
     Returns
     -------
-    values : all numbers, float64 but for that
-    sizes : how many there are in each line
+    values : all numbers, float64 unless `whole` applies
+    sizes : how many numbers each line has
 
     Raises
     ------
-    MeshFileError : a word is no number.
+    MeshFileError : a word is not a number.
     """
-    # What stands nowhere else marks the ends of lines.
+    # Mark the ends of lines by a value that does not occur elsewhere.
     values: npt.NDArray[Any]
     if whole and text and not text.translate(None, b" \n0123456789"):
         values = np.fromstring(text.replace(b"\n", b" -1 "), dtype=np.int64, sep=" ")
@@ -97,7 +97,7 @@ def points(text: bytes, name: str) -> npt.NDArray[np.float64]:
 
     Raises
     ------
-    MeshFileError : a line holds fewer, or a word that is no number.
+    MeshFileError : a line has fewer numbers, or a word is not a number.
     """
     values, sizes = number_rows(text, name)
     short = np.flatnonzero(sizes < 3)
@@ -114,17 +114,17 @@ def points(text: bytes, name: str) -> npt.NDArray[np.float64]:
 def vertex_numbers(
     values: npt.NDArray[Any], sizes: npt.NDArray[np.int64], name: str = "face"
 ) -> npt.NDArray[np.int64]:
-    """Return the corners of polygons as whole numbers.
+    """Return the corners of polygons as int64.
 
     Parameters
     ----------
     values : (sum of sizes,) array
-    sizes : (P,) corners of each polygon
-    name : what a polygon is called in the message
+    sizes : (P,) number of corners of each polygon
+    name : name of a polygon in error messages
 
     Raises
     ------
-    MeshFileError : a value is no whole number, such as 1.5 or infinity, or far too large.
+    MeshFileError : a value is not an integer, such as 1.5 or infinity, or is far too large.
     """
     bad = np.flatnonzero(~(np.abs(values) < 2**53) | (values != np.floor(values)))
     if len(bad):
@@ -137,7 +137,7 @@ def vertex_numbers(
 
 
 def _plain_decimals(text: bytes) -> npt.NDArray[np.float64] | None:
-    """Parse decimals, and the word `nan`, quickly; None if there is anything else."""
+    """Parse decimals and the word `nan` fast; return None if there is anything else."""
     if text.translate(None, b" \n0123456789+-.eEna"):
         return None
     blank = np.frombuffer(text, dtype=np.uint8) <= ord(" ")
@@ -146,7 +146,7 @@ def _plain_decimals(text: bytes) -> npt.NDArray[np.float64] | None:
         warnings.simplefilter("error", DeprecationWarning)
         try:
             values = np.fromstring(text, dtype=np.float64, sep=" ")
-        except (DeprecationWarning, ValueError):  # something that is no number
+        except (DeprecationWarning, ValueError):  # a word is not a number
             return None
-    # "1.2.3" is read as two.
+    # "1.2.3" is parsed as two numbers.
     return values if len(values) == n_words else None

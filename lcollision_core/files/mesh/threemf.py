@@ -1,6 +1,6 @@
-"""3MF, as printers read it: one solid in millimetres, in a package of three files.
+"""3MF for 3D printing: one solid in millimetres, in a package of three files.
 
-An own writer, because that of trimesh needs two further packages, and its bytes differ each time.
+It has its own writer because trimesh's needs two more packages, and its bytes differ each time.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.integer]) -> bytes:
             ("_rels/.rels", _RELATIONS),
             ("3D/3dmodel.model", f"{_HEAD}{rows}</vertices><triangles>\n{named}{_TAIL}"),
         ):
-            # Opened by name, an entry carries no date.
+            # Entries opened by name have no date.
             with archive.open(name, "w") as entry:
                 entry.write(text.encode("ascii"))
     return package.getvalue()
