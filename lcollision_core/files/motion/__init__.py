@@ -1,1 +1,1 @@
-"""Motions without a mesh of their own: skeletons and point caches."""
+"""Motions without faces: skeletons and point caches."""

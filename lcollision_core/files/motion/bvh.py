@@ -1,4 +1,4 @@
-"""BVH: a skeleton and its motion, as motion capture writes it; read and written."""
+"""Read and write BVH files: a skeleton and its motion, as from motion capture."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _MOST_BYTES = 1 << 30
 _MOST_JOINTS = 5000
 _MOST_NUMBERS = 500_000_000
 _LARGEST = 1e9
-"""Of a number: products of turns stay finite below it."""
+"""Largest number, so that products of rotations stay finite."""
 
 _AGAIN = "export the motion again"
 
 _MOTION = re.compile(r"(?:^|[\r\n])[ \t]*MOTION[ \t]*(?![^\r\n])")
-"""Alone in its line: joints may be called so as well."""
+"""Matches MOTION only on a line of its own, as a joint may have this name too."""
 
 _AXES = {"Xrotation": 0, "Yrotation": 1, "Zrotation": 2}
 _PLACES = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
@@ -34,7 +34,7 @@ _SCALES = {"Xscale": 0, "Yscale": 1, "Zscale": 2}
 _CHANNELS = {name.casefold(): name for name in (*_PLACES, *_AXES, *_SCALES)}
 
 _UNSCALED = 1e-3
-"""By which a scale may differ from 1."""
+"""Largest difference of a scale from 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +45,15 @@ class Bvh:
     ----------
     names : J names of the joints
     parents : (J,) int64 array, -1 for the root; parents come before children
-    offsets : (J, 3) float64 array, where each joint is at rest, seen from its parent. All joints
-        are turned alike at rest.
-    ends : (J, 3) float64 array, the mean of a joint's end sites, seen from it; NaN where it has
-        none
-    channels : of each joint, what its numbers in a frame are, in order, as "Zrotation"
-    frame_time : seconds
+    offsets : (J, 3) float64 array, rest position of each joint relative to its parent. All joints
+        have the same orientation at rest.
+    ends : (J, 3) float64 array, mean of a joint's end sites relative to it; NaN if it has none
+    channels : names of each joint's numbers in a frame, in order, such as "Zrotation"
+    frame_time : seconds per frame
     numbers : (T, C) float64 array, angles in degrees
-    lines : T lines of text, the frames as they stand in the file, with their ends
-    head : what comes before them
-    encoding : of the file's text
+    lines : T lines of text, the frames as in the file, with line ends
+    head : text before the frames
+    encoding : encoding of the text
     """
 
     names: tuple[str, ...]
@@ -74,22 +73,22 @@ class Bvh:
 
     @property
     def times(self) -> FloatArray:
-        """(T,) in seconds, from 0."""
+        """(T,) times in seconds, from 0."""
         return np.arange(len(self), dtype=np.float64) * self.frame_time
 
     def turns(self) -> FloatArray:
-        """Return how each joint is turned against its parent: (T, J, 3, 3) rotations."""
+        """Return the (T, J, 3, 3) rotations of the joints relative to their parents."""
         turned = np.broadcast_to(np.eye(3), (len(self), len(self.names), 3, 3)).copy()
         for joint, (columns, axes) in enumerate(self._columns(_AXES)):
             if axes:
                 angles = np.radians(self.numbers[:, columns])
-                # One axis of its own is an array without the second dimension.
+                # SciPy takes the angles of a single axis as a 1D array.
                 given = angles if len(axes) > 1 else angles[:, 0]
                 turned[:, joint] = Rotation.from_euler(axes, given).as_matrix()
         return turned
 
     def places(self) -> FloatArray:
-        """Return where each joint is, seen from its parent: (T, J, 3); the root in the world."""
+        """Return the (T, J, 3) positions of the joints relative to their parents or the world."""
         placed = np.broadcast_to(self.offsets, (len(self), *self.offsets.shape)).copy()
         for joint, (columns, axes) in enumerate(self._columns(_PLACES)):
             for column, axis in zip(columns, axes, strict=True):
@@ -97,13 +96,13 @@ class Bvh:
         return placed
 
     def with_frames(self, frames: Sequence[int], turns: FloatArray, roots: FloatArray) -> bytes:
-        """Return the file with some frames changed; the lines of all others stay as they are.
+        """Return the file with some frames changed; the lines of all others are kept.
 
         Parameters
         ----------
-        frames : n numbers of frames, ascending
-        turns : (n, J, 3, 3), as of `turns`
-        roots : (n, 3) places of the root
+        frames : n frame numbers, ascending
+        turns : (n, J, 3, 3), see `turns`
+        roots : (n, 3) positions of the root
         """
         numbers = self.numbers[list(frames)]
         for joint, (columns, axes) in enumerate(self._columns(_AXES)):
@@ -119,7 +118,7 @@ class Bvh:
         return (self.head + "".join(lines)).encode(self.encoding)
 
     def _columns(self, kinds: dict[str, int]) -> Iterator[tuple[list[int], str]]:
-        """Iterate over the joints: the columns of their channels of a kind, and these's axes."""
+        """Yield, for each joint, the columns and axes of its channels of one kind."""
         first = 0
         for names in self.channels:
             own = [place for place, name in enumerate(names) if name in kinds]
@@ -132,7 +131,7 @@ def read_bvh(path: str | os.PathLike[str]) -> Bvh:
 
     Raises
     ------
-    MeshFileError : the file is missing, too large, damaged, or no BVH file.
+    MeshFileError : the file is missing, too large, damaged, or not a BVH file.
     """
     try:
         return _parsed(*_decoded(read_regular(path, _MOST_BYTES)))
@@ -141,7 +140,7 @@ def read_bvh(path: str | os.PathLike[str]) -> Bvh:
 
 
 def _decoded(data: bytes) -> tuple[str, str]:
-    """Return the text, with its byte order mark, and its encoding; joints have names in any."""
+    """Return the text, with its byte order mark, and its encoding."""
     encoding = {b"\xff\xfe": "utf-16-le", b"\xfe\xff": "utf-16-be"}.get(data[:2], "utf-8")
     try:
         return data.decode(encoding), encoding
@@ -184,7 +183,7 @@ def _parsed(text: str, encoding: str) -> Bvh:
 
 
 def _numbers(text: bytes, n_columns: int) -> FloatArray:
-    """Return the (T, C) numbers of the lines of frames."""
+    """Parse the (T, C) numbers of the frames' lines."""
     numbers, sizes = number_rows(text, "frame")
     wrong = np.flatnonzero(sizes != n_columns)
     if len(wrong):
@@ -293,13 +292,13 @@ def _number(word: str) -> float:
 
 
 def angles_near(turns: FloatArray, axes: str, before: FloatArray) -> FloatArray:
-    """Return (n, A) degrees of (n, 3, 3) rotations: of all that mean the same, the nearest ones.
+    """Return the (n, A) Euler angles of (n, 3, 3) rotations nearest to `before`, in degrees.
 
-    A joint with fewer than three axes turns as far as they go.
+    With fewer than three axes, the angles about the others are dropped.
     """
     order = axes + "".join(axis for axis in "XYZ" if axis not in axes)
     with warnings.catch_warnings():
-        # Where two axes coincide, one angle is free; any will do.
+        # At gimbal lock one angle is free, and any will do.
         warnings.simplefilter("ignore", UserWarning)
         first, middle, last = Rotation.from_matrix(turns).as_euler(order, degrees=True).T
     ways = [(first, middle, last), (first + 180.0, 180.0 - middle, last + 180.0)]
@@ -311,10 +310,11 @@ def angles_near(turns: FloatArray, axes: str, before: FloatArray) -> FloatArray:
 
 
 _WRITTEN_AXES = "ZXY"
-"""The order of the rotations, the most common one."""
+"""Order of the rotations, the most common one."""
 
 _STILL = 1e-6
-"""Of the skeleton's extent: a joint that moves less, seen from its parent, has a fixed place."""
+"""Largest movement of a joint relative to its parent, in extents of the skeleton, that is ignored.
+"""
 
 _PER_JOINT = "Xposition Yposition Zposition ", " ".join(f"{axis}rotation" for axis in _WRITTEN_AXES)
 
@@ -328,19 +328,19 @@ def bvh_bytes(
     places: FloatArray,
     frame_time: float,
 ) -> bytes:
-    """Return a BVH file, in UTF-8.
+    """Encode a BVH file in UTF-8.
 
-    Joints that move against their parents have channels for that, as the root has.
+    Joints that move relative to their parents get position channels, as the root does.
 
     Parameters
     ----------
-    names : J names; what a BVH file cannot hold of them is replaced
-    parents : (J,) -1 for the one root; parents come before children
-    rest : (J, 3) where the joints are at rest, all of them turned alike
-    ends : (J, 3) where bones end, seen from their joints; used where nothing hangs on a joint
-    turns : (T, J, 3, 3) rotations of the joints against their parents
-    places : (T, J, 3) of the joints seen from their parents; the root in the world
-    frame_time : seconds
+    names : J names; characters that a BVH file cannot hold are replaced
+    parents : (J,) -1 for the only root; parents come before children
+    rest : (J, 3) global rest positions of the joints, which all have the same orientation
+    ends : (J, 3) ends of the bones relative to their joints, used for joints without children
+    turns : (T, J, 3, 3) rotations of the joints relative to their parents
+    places : (T, J, 3) positions of the joints relative to their parents, the root's global
+    frame_time : seconds per frame
     """
     order, depths = depth_first(parents)
     offsets = rest - np.where(parents[:, None] >= 0, rest[parents], 0.0)
@@ -370,7 +370,7 @@ def bvh_bytes(
 
 
 def depth_first(parents: npt.NDArray[np.int64]) -> tuple[list[int], list[int]]:
-    """Return the joints in the order of a file, and how deep each of them hangs."""
+    """Return the joints in the depth-first order of a file, and their depths."""
     children: list[list[int]] = [[] for _ in parents]
     waiting: list[int] = []
     for joint, parent in enumerate(parents.tolist()):
@@ -386,7 +386,7 @@ def depth_first(parents: npt.NDArray[np.int64]) -> tuple[list[int], list[int]]:
 
 
 def _smooth_angles(turns: FloatArray) -> Iterator[FloatArray]:
-    """Yield the (J, 3) degrees of each frame, as near to those of the frame before as they can."""
+    """Yield the (J, 3) angles of each frame in degrees, nearest to those of the frame before."""
     angles = np.zeros((turns.shape[1], len(_WRITTEN_AXES)))
     for frame in turns:
         angles = angles_near(frame, _WRITTEN_AXES, angles)
@@ -394,7 +394,7 @@ def _smooth_angles(turns: FloatArray) -> Iterator[FloatArray]:
 
 
 def _name(name: str, joint: int) -> str:
-    """Return a name as words of one line, without braces."""
+    """Return a name on one line, without braces."""
     return " ".join(re.sub(r"[{}\x00-\x1f\x7f]", " ", name).split()) or f"joint {joint}"
 
 

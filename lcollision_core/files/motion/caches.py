@@ -1,4 +1,4 @@
-"""PC2 and MDD: the vertices of a mesh frame by frame, beside the file of the mesh."""
+"""Read and write point caches, PC2 and MDD: the vertices of a mesh frame by frame."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 def read_point_cache(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
-    """Read the frames of a point cache; its extension, in any case, says the format.
+    """Read the frames of a point cache; the extension, in any case, determines the format.
 
-    What follows the announced frames is left aside: Blender's MDD files hold one frame more.
+    Data after the announced frames are ignored: Blender's MDD files have one more frame.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def read_point_cache(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
 
     Raises
     ------
-    MeshFileError : the file is missing, truncated, of another kind, announces more than it holds,
+    MeshFileError : the file is missing, truncated, of another format, announces more than it holds
         or more than `MAX_ITEMS` numbers, or a coordinate is not finite.
     """
     with _opened(path) as (file, size):
@@ -64,7 +64,7 @@ def read_point_cache(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
 
 
 def cache_rate(path: str | os.PathLike[str]) -> float | None:
-    """Return the frames a second of an .mdd file; None for others, which do not say it.
+    """Return the frames per second of an .mdd file; None for other formats, which lack it.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def cache_rate(path: str | os.PathLike[str]) -> float | None:
 
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[BinaryIO, int]]:
-    """Open a cache, and yield it with its size; what is wrong with it is said of its path."""
+    """Open a cache and yield it with its size; errors name its path."""
     try:
         with open_regular(path) as file:
             yield file, os.fstat(file.fileno()).st_size
@@ -105,7 +105,7 @@ def _read_mdd(file: BinaryIO, size: int) -> npt.NDArray[np.float32]:
 
 
 def _mdd_times(file: BinaryIO, size: int) -> tuple[Any, npt.NDArray[np.float32]]:
-    """Read the header and the times of the frames, which come first."""
+    """Read the header and the times of the frames, which follow it."""
     header = _header(file, _MDD_HEADER, size)
     n_bytes = 4 * max(int(header["n_frames"]), 0)
     _require_whole(header, size - _MDD_HEADER.itemsize - n_bytes)
@@ -137,7 +137,7 @@ def _frames(file: BinaryIO, header: Any, n_bytes: int, dtype: str) -> npt.NDArra
 
 
 def _require_whole(header: Any, n_bytes: int) -> None:
-    """Refuse a cache with fewer bytes for its frames than it announces."""
+    """Refuse a cache with fewer bytes than its announced frames need."""
     n_frames, n_points = int(header["n_frames"]), int(header["n_points"])
     if n_frames < 1 or n_points < 1 or 12 * n_frames * n_points > n_bytes:
         raise MeshFileError(
@@ -149,19 +149,19 @@ def _require_whole(header: Any, n_bytes: int) -> None:
 def write_point_cache(
     path: str | os.PathLike[str], frames: npt.ArrayLike, fps: float = 30.0
 ) -> None:
-    """Write a point cache whole or not at all; its extension, in any case, says the format.
+    """Write a point cache atomically; the extension, in any case, determines the format.
 
-    Frame 0 is at time 0. Both formats hold float32.
+    Frame 0 is at time 0. Both formats store float32.
 
     Parameters
     ----------
     path : a .pc2 or .mdd file in an existing folder
     frames : (N, V, 3) array, vertices in the order of the mesh, in its unit
-    fps : frames a second, which MDD stores
+    fps : frames per second, which only MDD stores
 
     Raises
     ------
-    ShapeError : another shape, a coordinate that float32 cannot hold, or fps is not above 0.
+    ShapeError : the shape is wrong, float32 cannot hold a coordinate, or fps is not above 0.
     MeshFileError : the extension is unknown, or the file cannot be written.
     """
     _suffix(path)
@@ -177,16 +177,16 @@ def write_point_cache(
 def point_cache(
     path: str | os.PathLike[str], n_frames: int, n_points: int, fps: float = 30.0
 ) -> Iterator[Callable[[npt.NDArray[Any]], None]]:
-    """Write a point cache frame by frame, whole or not at all: see `write_point_cache`.
+    """Write a point cache frame by frame, atomically: see `write_point_cache`.
 
     Yields
     ------
-    write : to be called with the (V, 3) vertices of each frame
+    write : call it with the (V, 3) vertices of each frame
 
     Raises
     ------
-    ShapeError : a coordinate that float32 cannot hold, or fps is not above 0.
-    MeshFileError : as of `write_point_cache`.
+    ShapeError : float32 cannot hold a coordinate, or fps is not above 0.
+    MeshFileError : see `write_point_cache`.
     """
     suffix = _suffix(path)
     if not 0.0 < fps < np.inf:
@@ -210,7 +210,7 @@ def point_cache(
 def read_frame(
     path: str | os.PathLike[str], frame: int, n_frames: int, n_points: int
 ) -> npt.NDArray[np.float32]:
-    """Read one frame of a point cache that `point_cache` wrote: (V, 3)."""
+    """Read one (V, 3) frame of a point cache that `point_cache` wrote."""
     is_mdd = _suffix(path) == ".mdd"
     head = _MDD_HEADER.itemsize + 4 * n_frames if is_mdd else _PC2_HEADER.itemsize
     with _opened(path) as (file, _):

@@ -1,8 +1,8 @@
-"""Motions as generators write them: arrays of joints' places, with their turns or without.
+"""Read motions of generators: arrays of joint positions, with or without rotations.
 
-Kimodo's .npz files hold both. The joints of HumanML3D, a .npy file of (T, 22, 3) places or of its
-(T, 263) vectors, and MDM's results.npy say no turns: these are fitted, each joint turning as little
-as it can from the one before.
+Kimodo's .npz files have both. HumanML3D's .npy files of (T, 22, 3) positions or (T, 263) vectors,
+and MDM's results.npy, have no rotations: these are fitted, each joint turning as little as possible
+relative to its parent.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _KIMODO_RATE, _HUMANML_RATE = 30.0, 20.0
 _LARGEST, _ROUNDED = 1e6, 1e-2
 _MOST_BYTES = 1 << 30
 _LEAST_HEIGHT, _MOST_HEIGHT = 0.6, 3.0
-"""Metres, between which the figure of vectors is that are not normalised."""
+"""Limits, in metres, of the height of a figure whose vectors are not normalised."""
 
 _SMPL = dict(
     zip(
@@ -42,11 +42,11 @@ _SMPL = dict(
 
 
 _JOINTS, _VECTORS = (len(_SMPL), 3), (263,)
-"""Of one frame of HumanML3D: the places of its joints, and its vector."""
+"""Shapes of one frame of HumanML3D, as joint positions and as a vector."""
 
 
 def _soma(fingers: dict[str, int], *, with_ends: bool) -> dict[str, int]:
-    """Return the parents of SOMA's joints by their names: with so many joints of each finger."""
+    """Return the parents of SOMA's joints by name, given the number of joints per finger."""
     parents: dict[str, int] = {}
 
     def chain(above: str, *names: str) -> None:
@@ -76,17 +76,17 @@ _SKELETONS = {
         _soma({"Thumb": 3, "Index": 4, "Middle": 4, "Ring": 4, "Pinky": 4}, with_ends=True),
     ),
 }
-"""By their number of joints, those that are known: what people call them, and their parents."""
+"""Known skeletons by number of joints: their names and parents."""
 
 
 def is_generated(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is one of these; it raises nothing."""
+    """Whether a file is of one of these formats; never raises."""
     suffix = Path(path).suffix.lower()
     return suffix == ".npy" or (suffix == ".npz" and {_PLACES, _TURNS} <= set(array_names(path)))
 
 
 def holds_joints(path: str | os.PathLike[str]) -> bool:
-    """Whether a .npy file is of a shape that is read here; it raises nothing."""
+    """Whether a .npy file has a shape that can be read here; never raises."""
     try:
         with open_regular(path) as file:
             shape, _, dtype = _header(file)
@@ -96,12 +96,12 @@ def holds_joints(path: str | os.PathLike[str]) -> bool:
 
 
 def read_generated(path: str | os.PathLike[str]) -> list[NodeMotion]:
-    """Read motions, in metres: several of a file of MDM's, one of others.
+    """Read motions in metres: several from an MDM file, one from others.
 
     Raises
     ------
-    MeshFileError : the file is missing or damaged, or holds arrays of another kind; the sentence
-        says what was expected.
+    MeshFileError : the file is missing or damaged, or has other arrays; the message says what was
+        expected.
     """
     try:
         if Path(path).suffix.lower() == ".npy":
@@ -128,11 +128,11 @@ def read_generated(path: str | os.PathLike[str]) -> list[NodeMotion]:
 
 
 def _filled(places: FloatArray) -> tuple[int, tuple[str, ...]]:
-    """Return how many frames there are before those that only fill (T, J, 3), and a note on them.
+    """Return the number of frames before the padding of (T, J, 3) positions, and a note on it.
 
     Raises
     ------
-    MeshFileError : there is none.
+    MeshFileError : all frames are padding.
     """
     used = np.flatnonzero(np.ptp(places, axis=1).max(axis=1) > 0.0)
     if not len(used):
@@ -144,11 +144,11 @@ def _filled(places: FloatArray) -> tuple[int, tuple[str, ...]]:
 
 
 def _header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, order and type of an array of NumPy, whose values follow.
+    """Read the shape, order and dtype of a NumPy array, whose values follow.
 
     Raises
     ------
-    MeshFileError, ValueError : it is none.
+    MeshFileError, ValueError : it is not a NumPy array.
     """
     if file.read(6) != b"\x93NUMPY":
         raise MeshFileError("it is no array of NumPy")
@@ -158,12 +158,12 @@ def _header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
         read = np.lib.format
         return (read.read_array_header_1_0 if is_short else read.read_array_header_2_0)(file)
     except (SyntaxError, TokenError) as error:
-        # NumPy reads it as a dict of Python.
+        # NumPy parses the header as a Python dict.
         raise MeshFileError("its header is damaged") from error
 
 
 def _samples(path: Path) -> list[tuple[str, FloatArray, str]]:
-    """Return the motions of a .npy file: a name, (T, 22, 3) places of joints, and what it is."""
+    """Return the motions of a .npy file: name, (T, 22, 3) joint positions and description."""
     expected = (
         "(T, 22, 3), places of the joints of HumanML3D, (T, 263), its vectors, or the dict of "
         "MDM's results.npy with 'motion'"
@@ -203,14 +203,14 @@ def _samples(path: Path) -> list[tuple[str, FloatArray, str]]:
 
 
 def _joints_of_vectors(vectors: FloatArray) -> FloatArray:
-    """Return the (T, 22, 3) places of joints that (T, 263) vectors of HumanML3D hold.
+    """Return the (T, 22, 3) joint positions of (T, 263) vectors of HumanML3D.
 
     Notes
     -----
     `recover_from_ric` of HumanML3D (Guo et al. 2022, "Generating Diverse and Natural 3D Human
-    Motions from Text"): a vector begins with the turning speed about y (half the angle, as of a
-    quaternion), the root's speed along x and z as it sees them, its height, and the places of 21
-    joints as the root sees them, its own along x and z left out.
+    Motions from Text"): a vector begins with the root's angular velocity about y (half the angle,
+    as of a quaternion), its velocity along x and z in its local frame, its height, and the
+    positions of the other 21 joints in that frame, relative to the root along x and z.
     """
     half = np.concatenate([[0.0], np.cumsum(vectors[:-1, 0])])
     turns = Rotation.from_rotvec(np.multiply.outer(-2.0 * half, [0.0, 1.0, 0.0]))
@@ -245,7 +245,7 @@ def _motion(
     rate: float,
     notes: tuple[str, ...],
 ) -> NodeMotion:
-    """Return the motion of joints that have these places and turns in the world."""
+    """Return the motion of joints with these global positions and rotations."""
     parents = np.array(list(skeleton.values()))
     seen, local = places.copy(), turns.copy()
     for joint, parent in enumerate(parents.tolist()):
@@ -261,7 +261,7 @@ def _motion(
 
 
 def _fitted(places: FloatArray, what: str) -> NodeMotion:
-    """Return a motion of SMPL's joints whose turns are fitted to their (T, 22, 3) places."""
+    """Return a motion of SMPL's joints with rotations fitted to (T, 22, 3) positions."""
     names, parents = list(_SMPL), np.array(list(_SMPL.values()))
     turns = np.broadcast_to(np.eye(3), (*places.shape, 3)).copy()
     for joint, parent in enumerate(parents.tolist()):
@@ -269,7 +269,7 @@ def _fitted(places: FloatArray, what: str) -> NodeMotion:
         if parent >= 0:
             turns[:, joint] = turns[:, parent]
         if names[joint] in ("pelvis", "spine3"):
-            # Its left, its right and its upper one.
+            # The left, right and upper child.
             kinds = sorted(below.tolist(), key=lambda one: ("_" not in names[one], one))
             turns[:, joint] = _axes_of(*(places[:, kind] for kind in kinds))
         elif len(below):
@@ -291,7 +291,7 @@ def _fitted(places: FloatArray, what: str) -> NodeMotion:
 
 
 def _axes_of(left: FloatArray, right: FloatArray, upper: FloatArray) -> FloatArray:
-    """Return left, up and front of a trunk's joint, by the (T, 3) places of its children."""
+    """Return the left, up and front axes of a trunk joint from its children's (T, 3) positions."""
     across, up = left - right, upper - 0.5 * (left + right)
     x = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
     z = np.cross(x, up)
@@ -301,7 +301,7 @@ def _axes_of(left: FloatArray, right: FloatArray, upper: FloatArray) -> FloatArr
 
 
 def _rest_way(name: str) -> FloatArray:
-    """Return where the bone that ends in a joint points in a T pose."""
+    """Return the direction, in a T pose, of the bone that ends in a joint."""
     if name.endswith(("shoulder", "elbow", "wrist")):
         return np.array([1.0 if name.startswith("left") else -1.0, 0.0, 0.0])
     if name.endswith("_foot"):

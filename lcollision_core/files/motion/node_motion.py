@@ -1,4 +1,4 @@
-"""Nodes of a scene in motion as a skeleton, whatever they show."""
+"""Motions of a scene's nodes as a skeleton, with or without meshes."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from lcollision_core.files.scene.transforms import are_regular
 from lcollision_core.meshes.topology import FloatArray
 
 _SAME_AXIS = 0.5
-"""Cosine: axes are along each other, or across."""
+"""Cosine that separates parallel axes from perpendicular ones."""
 
 
 _SHORT = 1e-9
-"""What has no length."""
+"""Length below which a vector counts as zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class NodeMotion:
-    """A skeleton in motion, as `standing_pose.SkeletonMotion` asks for it, in the file's unit.
+    """A skeleton in motion, in the file's unit; implements `standing_pose.SkeletonMotion`.
 
     Attributes
     ----------
-    name : of the clip
+    name : name of the clip
     names : J names of the joints
     parents : (J,) int64 array, -1 for a root; parents come before children
-    offsets : (J, 3) where each joint is at rest, seen from its parent
-    ends : (J, 3), NaN: nodes do not say where bones end
-    axes : (J, 3, 3) rotations, how each joint's own axes lie in the world at rest
+    offsets : (J, 3) rest position of each joint relative to its parent
+    ends : (J, 3), NaN, as nodes do not define where bones end
+    axes : (J, 3, 3) rotations from each joint's local axes to the world at rest
     times : (T,) in seconds, from 0
-    up : (3,) unit vector, an axis; None where the file does not say it
+    up : (3,) unit vector, an axis; None if the file does not define it
     notes : sentences on what was left out
     """
 
@@ -57,11 +57,11 @@ class NodeMotion:
         return len(self.times)
 
     def turns(self) -> FloatArray:
-        """Return how each joint is turned from its rest, against its parent: (T, J, 3, 3)."""
+        """Return the (T, J, 3, 3) rotations of the joints from rest, relative to their parents."""
         return self._turns.copy()
 
     def places(self) -> FloatArray:
-        """Return where each joint is, seen from its parent: (T, J, 3); a root in the world."""
+        """Return the (T, J, 3) positions of the joints relative to their parents or the world."""
         return self._places.copy()
 
 
@@ -72,14 +72,15 @@ def motion_of_nodes(
     names: Sequence[str],
     fps: float | FloatArray | None = None,
 ) -> NodeMotion:
-    """Return some nodes of a scene in motion; scales are left out.
+    """Return the motion of some nodes of a scene; scales are ignored.
 
     Parameters
     ----------
-    scene : that the clip is of
+    scene : scene of the clip
+    clip : the clip to sample
     nodes : parents before children
-    names : of the nodes
-    fps : frames a second; None for the rate of the clip's keys, or the (T,) times of the frames
+    names : names of the nodes
+    fps : frames per second; None for the rate of the clip's keys, or the (T,) times of the frames
 
     Raises
     ------
@@ -102,7 +103,7 @@ def motion_of_nodes(
     turns: FloatArray = in_motion @ np.swapaxes(axes, -2, -1)
     world, places = turns.copy(), moved[..., :3, 3].copy()
     offsets = rest[:, :3, 3].copy()
-    # Where the bind pose turns a joint, what hangs on it goes along.
+    # A joint that the bind pose turns carries its children along.
     changed = axes @ np.swapaxes(at_rest, -2, -1)
     for joint, parent in enumerate(parents.tolist()):
         if parent >= 0:
@@ -121,14 +122,14 @@ def motion_of_nodes(
 def motions_of_scene(
     scene: Scene, clip: str | None = None, fps: float | None = None, most: int | None = None
 ) -> list[NodeMotion]:
-    """Return the skeleton of a scene as its clips move it.
+    """Return the motions of a scene's skeleton by its clips.
 
     Parameters
     ----------
-    scene : with its nodes alone
-    clip : one of the clips by its name; None for all of them
-    fps : frames a second; None for the rate of the clips' keys
-    most : frames of each clip, evenly spaced; all if None
+    scene : scene of nodes only
+    clip : name of one of the clips; None for all
+    fps : frames per second; None for the rate of the clips' keys
+    most : most frames of each clip, evenly spaced; None for all
 
     Raises
     ------
@@ -140,7 +141,7 @@ def motions_of_scene(
     names = [scene.node_names[node] for node in nodes]
     chosen = [scene_clip for scene_clip in scene.clips if clip in (None, scene_clip.name)]
     if not chosen:
-        # Says which there are.
+        # This raises an error that lists the clips.
         sample_clip(scene, clip or "", None)
     motions = []
     for chosen_clip in chosen:
@@ -153,11 +154,11 @@ def motions_of_scene(
 
 
 def skeleton_nodes(scene: Scene) -> list[int]:
-    """Return the nodes that are a scene's skeleton, parents first.
+    """Return the nodes of a scene's skeleton, parents first.
 
-    Those that carry skins and what hangs on them, without what shows something; where nothing is
-    skinned all that show nothing. Of several trees it is the one with most of them, from where it
-    begins to move or to branch.
+    These are the joints of skins and their descendants that show nothing; without skins, all nodes
+    that show nothing. Of several trees, it is the one with most such nodes, from the first node
+    that moves or branches.
     """
     order, parents = parents_first(scene.parents), scene.parents.tolist()
     own: set[int] = set()
@@ -186,7 +187,7 @@ def skeleton_nodes(scene: Scene) -> list[int]:
 
 
 def rotations_of(transforms: FloatArray) -> FloatArray:
-    """Return the (..., 3, 3) rotations nearest to transforms; of what has no size none."""
+    """Return the (..., 3, 3) rotations nearest to transforms; the identity for singular ones."""
     linear = np.where(are_regular(transforms)[..., None, None], transforms[..., :3, :3], np.eye(3))
     mirrored = np.linalg.det(linear) < 0.0
     left, _, right = np.linalg.svd(linear * np.where(mirrored, -1.0, 1.0)[..., None, None])
@@ -195,7 +196,7 @@ def rotations_of(transforms: FloatArray) -> FloatArray:
 
 
 def _bound_axes(scene: Scene, nodes: Sequence[int], at_rest: FloatArray) -> FloatArray:
-    """Return the axes of nodes in the bind pose of the skin, as they are stored where it has none.
+    """Return the axes of nodes in the bind pose of the skin, or the stored ones without a skin.
 
     Parameters
     ----------
@@ -211,7 +212,7 @@ def _bound_axes(scene: Scene, nodes: Sequence[int], at_rest: FloatArray) -> Floa
     if not rows:
         return axes
     rotations = rotations_of(bound[regular])
-    # A mesh may have axes of its own.
+    # A mesh may have other axes than the scene.
     axes[rows] = nearest_axes(at_rest[rows] @ np.swapaxes(rotations, 1, 2)) @ rotations
     number = {node: row for row, node in enumerate(nodes)}
     for row, node in enumerate(nodes):
@@ -224,11 +225,11 @@ def _bound_axes(scene: Scene, nodes: Sequence[int], at_rest: FloatArray) -> Floa
 def nearest_axes(
     rotations: FloatArray, one: FloatArray | None = None, other: FloatArray | None = None
 ) -> FloatArray:
-    """Return the (3, 3) rotation by quarter turns that is nearest to (n, 3, 3) others together.
+    """Return the (3, 3) rotation by quarter turns that is nearest to (n, 3, 3) rotations overall.
 
     Parameters
     ----------
-    one, other : axes, of which it takes one to the other; any if None
+    one, other : if given, the rotation must take the first axis to the second
     """
     quarters = Rotation.create_group("O").as_matrix().round()
     if one is not None and other is not None:
@@ -240,7 +241,7 @@ def nearest_axes(
 def least_turns(ways: FloatArray, others: FloatArray) -> FloatArray:
     """Return the (N, 3, 3) smallest rotations from (N, 3) directions to others.
 
-    None of what has no length, or of opposite ways, which have no smallest turn.
+    It is the identity for zero vectors and for opposite directions, whose rotation is ambiguous.
     """
     a = ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), _SHORT)
     b = others / np.maximum(np.linalg.norm(others, axis=1, keepdims=True), _SHORT)

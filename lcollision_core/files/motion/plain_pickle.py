@@ -1,7 +1,7 @@
-"""NumPy's pickled arrays, read without running anything that they name.
+"""Read NumPy's pickled arrays without running any code that they refer to.
 
-What a pickle may hold here are arrays, dicts, lists, texts and numbers. No class of NumPy is made
-while it is read: arrays stay bytes until their type is known to be one of plain values.
+A pickle may only contain arrays, dicts, lists, strings and numbers. No NumPy class is instantiated
+while reading: arrays stay bytes until their dtype is known to be plain.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _PLAIN = re.compile(r"[<>|=]?(f[248]|[iu][1248]|b1|[US]\d{1,6})")
 
 
 class _Type:
-    """A dtype as it is pickled."""
+    """A pickled dtype."""
 
     def __init__(self, code: str, *_: object) -> None:
         self.code, self.order = str(code), "|"
@@ -34,7 +34,7 @@ class _Type:
 
 
 class _Array:
-    """An array as it is pickled."""
+    """A pickled array."""
 
     state: Any = None
 
@@ -86,11 +86,11 @@ class _Unpickler(pickle.Unpickler):
 
 
 def read_plain_pickle(data: bytes) -> Any:
-    """Return the dicts, lists, texts, numbers and arrays that a pickle holds.
+    """Return the dicts, lists, strings, numbers and arrays of a pickle.
 
     Raises
     ------
-    ValueError : it is damaged, or holds anything else; nothing of that was run.
+    ValueError : it is damaged, or contains anything else; no code of it was run.
     """
     try:
         return _value(_Unpickler(io.BytesIO(data)).load())

@@ -1,4 +1,4 @@
-"""Motions of SMPL, SMPL-H and SMPL-X in .npz files, as of AMASS, and the same files changed."""
+"""Read motions of SMPL, SMPL-H and SMPL-X in .npz files such as AMASS's, and change such files."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ _Hands = Mapping[str, tuple[FloatArray, FloatArray]]
 _WHOLE = ("poses", "fullpose", "full_pose")
 _TRANS, _RATES = ("trans", "transl"), ("mocap_framerate", "mocap_frame_rate", "fps")
 _FLAT = "flat_hand_mean"
-"""Whether hands are turned from the flat one. Where it is not said they are, except in components,
-which count from the mean."""
+"""Whether hand poses are relative to the flat hand. The default is true, except for components,
+which are relative to the mean."""
 
 _BOTH = (*HAND_JOINTS["left"], *HAND_JOINTS["right"])
 _PARTS: dict[str, tuple[str, ...]] = {
@@ -45,7 +45,7 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "right_hand_pose": HAND_JOINTS["right"],
     "pose_hand": _BOTH,
 }
-"""Arrays of some joints' turns: of AMASS, of the package smplx, and, beside `poses`, of
+"""Arrays of some joints' rotations: in AMASS, in the package smplx, and, beside `poses`, in
 HY-Motion."""
 
 _KEYS = (*_WHOLE, *_PARTS)
@@ -55,21 +55,21 @@ _LEFT_OUT = dict.fromkeys(
 
 _LARGEST = 1e6
 _SAME = 1e-6
-"""Of radians, by which two arrays of the same turns may differ."""
+"""Largest difference, in radians, of two arrays of the same rotations."""
 
 _AGAIN = "export the motion again"
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Where a file keeps the turns of some joints.
+    """An array of a file with the rotations of some joints.
 
     Attributes
     ----------
     name, array : as in the file, T rows
-    joints : numbers of the joints in the motion
-    base : (n, 3 joints) components of which the rows are shares; None where they are the turns
-    mean : (3 joints,) what is added
+    joints : indices of the joints in the motion
+    base : (n, 3 joints) components that the rows weight; None if the rows are rotation vectors
+    mean : (3 joints,) added to the result
     """
 
     name: str
@@ -79,12 +79,12 @@ class _Part:
     mean: FloatArray
 
     def turns(self) -> FloatArray:
-        """(T, 3 joints)."""
+        """Return the (T, 3 joints) rotation vectors."""
         turns: FloatArray = self.array.reshape(len(self.array), -1).astype(np.float64)
         return (turns if self.base is None else turns @ self.base) + self.mean
 
     def changed(self, frames: Sequence[int], turns: FloatArray) -> npt.NDArray[np.floating]:
-        """Return the array with (n, J, 3) turns in n frames, as nearly as its components go."""
+        """Return the array with (n, J, 3) rotations in n frames, as near as components allow."""
         array, before = self.array.copy(), self.turns()[list(frames)]
         after = nearest_winding(turns[:, self.joints], before.reshape(-1, len(self.joints), 3))
         changed = after.reshape(before.shape) - self.mean
@@ -100,15 +100,15 @@ class SmplMotion:
 
     Attributes
     ----------
-    path : of its file
-    names : J names of the joints that it turns, of `JOINT_NAMES`
-    turns : (T, J, 3) float64 array, rotation vectors of the joints against their parents
-    places : (T, 3) float64 array, in metres, what is added to all vertices
-    betas : (B,) float64 array, the shape; zeros where the file has none
-    rate : frames a second; None where the file does not say it
+    path : path of its file
+    names : J names of the joints that it turns, from `JOINT_NAMES`
+    turns : (T, J, 3) float64 array, rotation vectors of the joints relative to their parents
+    places : (T, 3) float64 array, in metres, added to all vertices
+    betas : (B,) float64 array, the shape; empty if the file has none
+    rate : frames per second; None if the file does not define it
     notes : sentences on what was left out
-    gender, body_model : what the file says of the body that it was made for, in lower case, as
-        "female" and "smplx"; "" where it does not
+    gender, body_model : body that the motion was made for, in lower case, such as "female" and
+        "smplx"; empty if the file does not define it
     """
 
     path: Path
@@ -130,17 +130,17 @@ class SmplMotion:
     def write(
         self, file: IO[bytes], frames: Sequence[int], turns: FloatArray, places: FloatArray
     ) -> None:
-        """Write the file with some frames changed; all other arrays keep their bytes, unread.
+        """Write the file with some frames changed; other arrays are copied byte for byte.
 
         Parameters
         ----------
         file : open binary file
-        frames : n numbers of frames
+        frames : n frame numbers
         turns, places : (n, J, 3) and (n, 3)
 
         Raises
         ------
-        MeshFileError : what the file holds beside is damaged.
+        MeshFileError : another entry of the file is damaged.
         """
         name, array = self._trans
         moved = array.copy()
@@ -162,7 +162,7 @@ class SmplMotion:
 
 
 def is_smpl_motion(path: str | os.PathLike[str]) -> bool:
-    """Whether an .npz file holds the turns of joints, and no meshes; it raises nothing."""
+    """Whether an .npz file has rotations of joints, and no meshes; never raises."""
     names = array_names(path)
     return "vertices" not in names and not {*_KEYS, *_TRANS}.isdisjoint(names)
 
@@ -172,12 +172,12 @@ def read_smpl_motion(path: str | os.PathLike[str], hands: _Hands | None = None) 
 
     Parameters
     ----------
-    hands : components of the hands' poses by side, of the body model: see `SmplModel`
+    hands : components of the body model's hand poses by side: see `SmplModel`
 
     Raises
     ------
-    MeshFileError : the file is missing, damaged, holds Python objects, or no motion that can be
-        used. The sentence names the file.
+    MeshFileError : the file is missing, damaged, has Python objects, or no usable motion. The
+        message names the file.
     """
     known = (*_KEYS, *_TRANS, *_RATES, "betas", _FLAT)
     try:
@@ -233,7 +233,7 @@ def _motion(
 def _kept(
     arrays: dict[str, npt.NDArray[Any]], hands: _Hands
 ) -> Iterator[tuple[str, tuple[str, ...], FloatArray | None, FloatArray]]:
-    """Iterate over the arrays of turns: name, joints, and `_Part.base` and `_Part.mean`."""
+    """Yield the name, joints, `_Part.base` and `_Part.mean` of each array of rotations."""
     flat = arrays.get(_FLAT)
     if flat is not None and flat.dtype.kind not in "biuf":
         raise MeshFileError(f"its {_FLAT!r} is neither true nor false")
@@ -271,7 +271,7 @@ def _kept(
 def _floats(
     arrays: Mapping[str, npt.NDArray[Any]], name: str, rest: tuple[int, ...] | None = None
 ) -> FloatArray:
-    """Return an array of at least one row, of some further sizes; None for one or two of any."""
+    """Return a float array of shape (T, *rest), or with any one or two further sizes if None."""
     array = arrays[name]
     fits = array.shape[1:] == rest if rest is not None else array.ndim in (2, 3)
     if not fits or not array.size or array.dtype.kind != "f":
@@ -292,11 +292,11 @@ def _floats(
 
 
 def _word(path: Path, name: str) -> str:
-    """Return the first word of a text that a file holds, in lower case; "" of anything else."""
+    """Return the first word of a string in a file, in lower case; empty for anything else."""
     try:
         array = read_npz(path, [(name,)])[0].get(name)
     except MeshFileError:
-        # Pickled, as some files hold it: it stays unread.
+        # Some files pickle the string, which is not read.
         return ""
     if array is None or array.dtype.kind not in "SU" or array.size != 1:
         return ""

@@ -1,4 +1,4 @@
-"""VRMA: a VRM animation, the motion of a humanoid skeleton without a body; read and written."""
+"""Read and write VRMA (VRM animation) files: the motion of a humanoid skeleton without a body."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def read_vrma(path: str | os.PathLike[str], fps: float | None = None) -> NodeMot
 
     Parameters
     ----------
-    fps : frames a second; None for the rate of the file's keys
+    fps : frames per second; None for the rate of the file's keys
 
     Raises
     ------
@@ -51,7 +51,7 @@ def _motion(document: GltfDocument, fps: float | None) -> NodeMotion:
 
 
 def _left_out(document: GltfDocument, n_clips: int) -> Iterator[str]:
-    """Yield sentences on what else a VRM animation holds."""
+    """Yield notes on the content of a VRM animation that is not read."""
     extension = extension_of(document.description, _EXTENSION)
     expressions = inner(extension, "expressions")
     named = [name for kind in ("preset", "custom") for name in inner(expressions, kind)]
@@ -74,15 +74,15 @@ def vrma_bytes(
     hips: FloatArray,
     times: FloatArray,
 ) -> bytes:
-    """Return a VRM animation 1.0, a GLB file with one clip of linear keys.
+    """Encode a VRM animation 1.0, a GLB file with one clip of linear keys.
 
     Parameters
     ----------
-    names : B bones of VRM, as "leftUpperArm", the hips first
-    parents : of the bones, -1 for the hips; parents come before children
-    offsets : (B, 3) where each bone is in the T pose, seen from its parent, in metres, y up
-    turns : (T, B, 3, 3) rotations of the bones from the T pose, against their parents
-    hips : (T, 3) places of the hips, in metres
+    names : names of B VRM bones, such as "leftUpperArm", the hips first
+    parents : parents of the bones, -1 for the hips; parents come before children
+    offsets : (B, 3) positions of the bones in the T pose relative to their parents, metres, y up
+    turns : (T, B, 3, 3) rotations of the bones from the T pose, relative to their parents
+    hips : (T, 3) positions of the hips, metres
     times : (T,) in seconds, ascending
 
     Raises
@@ -109,7 +109,7 @@ def vrma_bytes(
     move(0, "translation", hips)
     for number in range(len(names)):
         turned = Rotation.from_matrix(turns[:, number]).as_quat()
-        # The shorter way from key to key.
+        # Make interpolation between keys take the shorter arc.
         flips = np.cumprod(np.where((turned[1:] * turned[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))
         turned[1:] *= flips[:, None]
         move(number, "rotation", turned)

@@ -1,1 +1,1 @@
-"""Scenes, whatever their format: nodes, parts, clips and looks."""
+"""Scenes in any format: nodes, parts, clips and appearance."""

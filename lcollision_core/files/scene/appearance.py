@@ -1,4 +1,4 @@
-"""How a mesh looks: materials, textures' images, and colours on points that its seams split."""
+"""Appearance of a mesh: materials, textures, and colours on points that are split at seams."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 IntArray = npt.NDArray[np.int64]
 
 LEAST_SEEN = 1.0 / 255.0
-"""The opacity below which a blended material shows nothing."""
+"""Opacity below which a blended material is invisible."""
 
 
 class Wrap(Enum):
-    """What an image shows outside of coordinates from 0 to 1."""
+    """Extension of an image beyond texture coordinates from 0 to 1."""
 
     REPEAT = "repeat"
     MIRROR = "mirror"
@@ -41,9 +41,9 @@ class Texture:
     pixels : (H, W, 4) uint8 array, red, green and blue in sRGB, and opacity; the first row is at
         v = 0
     wrap : along u, along v
-    is_smooth : whether large pixels blend into each other
-    has_mipmaps : whether small pixels are averaged
-    file : the image's file, where only that holds it, and not the glTF file; else empty
+    is_smooth : whether magnified pixels are interpolated
+    has_mipmaps : whether minified pixels are averaged
+    file : bytes of the image file for an image of an FBX file; else empty
     """
 
     pixels: npt.NDArray[np.uint8]
@@ -55,15 +55,15 @@ class Texture:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What faces are made of; its colour multiplies into those of the points.
+    """Material of faces; its texture is multiplied with the colours of the points.
 
     Attributes
     ----------
-    texture : None for the points' colours alone
-    cutoff : opacity below which nothing is seen; what is seen is opaque, unless it blends
-    is_blended : whether what is behind shines through by the opacity
-    is_double_sided : whether faces are seen from behind
-    is_lit : False for colours that no light changes
+    texture : None for the colours of the points only
+    cutoff : opacity below which a pixel is invisible; others are opaque unless blended
+    is_blended : whether the opacity blends with the background
+    is_double_sided : whether back faces are visible
+    is_lit : whether light changes the colours
     """
 
     texture: Texture | None = None
@@ -75,21 +75,21 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """How the faces of a mesh look.
+    """Appearance of the faces of a mesh.
 
-    A vertex at a seam has several points, with other colours or texture coordinates.
+    A vertex at a seam has several points with different colours or texture coordinates.
 
     Attributes
     ----------
-    vertices : (P,) int64 array, the vertex of the mesh that each of the P points lies on
+    vertices : (P,) int64 array, the mesh vertex of each of the P points
     faces : (F, 3) int64 array, indices of points
     uv : (P, 2) float32 array, texture coordinates
     colours : (P, 4) uint8 array, red, green and blue in sRGB, and opacity
     material_of : (F,) int64 array, indices into `materials`
-    materials : no two are the same object
+    materials : distinct materials
     notes : sentences on what could not be read
-    normals : (P, 3) float32 array, in the coordinates of the mesh; None where they are not asked
-        for, or its file has none
+    normals : (P, 3) float32 array, in the coordinates of the mesh; None if not requested or not in
+        the file
     """
 
     vertices: IntArray
@@ -103,7 +103,7 @@ class Appearance:
 
     @property
     def is_plain(self) -> bool:
-        """Whether it is white all over, as what has no material is."""
+        """Whether the mesh is white all over, as without materials."""
         has_texture = any(material.texture is not None for material in self.materials)
         return not has_texture and bool((self.colours == 255).all())
 
@@ -111,13 +111,13 @@ class Appearance:
 def join_appearances(
     parts: Sequence[Appearance], counts: Sequence[int], joined: IntArray
 ) -> Appearance:
-    """Make one appearance of those of the parts of a mesh.
+    """Join the appearances of the parts of a mesh.
 
     Parameters
     ----------
-    parts : of each part
-    counts : how many vertices each part has, W in all
-    joined : (W,) array, the vertex of the mesh that each vertex of the parts is
+    parts : appearance of each part
+    counts : number of vertices of each part, W in all
+    joined : (W,) array, the mesh vertex of each vertex of the parts
     """
     materials = list(dict.fromkeys(material for part in parts for material in part.materials))
     number = {material: index for index, material in enumerate(materials)}
@@ -141,17 +141,17 @@ def join_appearances(
 
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA")
 _MOST_SIDE = 2048
-"""Pixels of the longer side; larger images are shrunk to it."""
+"""Most pixels of the longer side; larger images are downscaled."""
 
 _MOST_PIXELS = 1 << 26
-"""Of an image in a file; decoding needs up to 8 bytes for each."""
+"""Most pixels of an image in a file; decoding takes up to 8 bytes per pixel."""
 
 _MOST_BYTES = 1 << 29
-"""Of all images of a file together, once they are shrunk."""
+"""Most bytes of all images of a file together, after downscaling."""
 
 
 class ImageReader:
-    """Decodes the images of one file, within a limit for all of them."""
+    """Decodes the images of one file, up to a limit for all together."""
 
     def __init__(self) -> None:
         self._left = _MOST_BYTES
@@ -161,12 +161,12 @@ class ImageReader:
 
         Parameters
         ----------
-        data : a file of a common format
-        what : as in "image 3"
+        data : bytes of an image file in a common format
+        what : name in error messages, such as "image 3"
 
         Returns
         -------
-        pixels : (H, W, 4) array, from top to bottom; at most `_MOST_SIDE` pixels a side
+        pixels : (H, W, 4) array, from top to bottom; at most `_MOST_SIDE` pixels per side
 
         Raises
         ------
@@ -179,14 +179,13 @@ class ImageReader:
                 image = Image.open(io.BytesIO(data), formats=_FORMATS)
             if image.width * image.height > _MOST_PIXELS:
                 raise Image.DecompressionBombError
-            # Of a large JPEG no more is decoded than is needed.
+            # Decode a large JPEG at a reduced size.
             image.draft(None, (_MOST_SIDE, _MOST_SIDE))
             pixels = _shrunk(_in_8_bits(image))
         except Image.DecompressionBombError as error:
             most = f"more than {_MOST_PIXELS >> 20} million pixels"
             raise MeshFileError(f"has {most}", where=what) from error
-        # On a damaged image Pillow raises whatever its line at hand raises; nothing of ours runs
-        # here.
+        # Pillow raises errors of any type for damaged images; none of our code runs here.
         except Exception as error:
             raise MeshFileError(
                 f"is damaged or no {', '.join(_FORMATS[:-1])} or {_FORMATS[-1]} image", where=what
@@ -201,7 +200,7 @@ class ImageReader:
 
 def _in_8_bits(image: Image) -> Image:
     if image.mode.startswith("I"):
-        # Pillow would clip 16 bits, not scale them.
+        # Pillow would clip 16-bit values instead of scaling them.
         grey = np.asarray(image).astype(np.uint32) >> 8
         from PIL import Image as Images
 
@@ -212,13 +211,14 @@ def _in_8_bits(image: Image) -> Image:
 def _shrunk(image: Image) -> npt.NDArray[np.uint8]:
     scale = _MOST_SIDE / max(image.size)
     size = max(1, round(scale * image.width)), max(1, round(scale * image.height))
-    # Band by band: where nothing is opaque, colours would be lost, which some materials show.
+    # Resize each band alone: otherwise transparent pixels lose their colours, which some materials
+    # show.
     bands = [band if scale >= 1.0 else band.resize(size) for band in image.split()]
     return np.stack([np.asarray(band) for band in bands], axis=-1)
 
 
 def screen_colours(linear: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
-    """Return (n, 4) linear colours from 0 to 1 in sRGB; the opacity stays linear."""
+    """Convert (n, 4) linear colours from 0 to 1 to sRGB; the opacity stays linear."""
     light = linear[:, :3]
     colours = np.array(linear, dtype=np.float64)
     colours[:, :3] = np.where(
@@ -228,7 +228,7 @@ def screen_colours(linear: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
 
 
 def linear_colours(colours: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
-    """Return the linear colours from 0 to 1 of (n, 4) colours in sRGB: see `screen_colours`."""
+    """Convert (n, 4) sRGB colours to linear ones from 0 to 1: see `screen_colours`."""
     linear = colours / 255.0
     light = linear[:, :3]
     linear[:, :3] = np.where(light <= 0.04045, light / 12.92, ((light + 0.055) / 1.055) ** 2.4)

@@ -1,4 +1,4 @@
-"""FBX, read by ufbx in a process of its own: meshes, rigs, clips, and how they look."""
+"""Read FBX by ufbx in a separate process: meshes, rigs, clips and appearance."""
 
 from __future__ import annotations
 
@@ -51,16 +51,16 @@ IntArray = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Laid:
-    """The faces that a look is laid on.
+    """The faces of a mesh, to which an appearance is applied.
 
     Attributes
     ----------
-    number : of the mesh among those that are shown
-    is_used : (C,) bool array, which of the mesh's corners are of polygons
-    corners : (c,) int64 array, the vertices of those that are, polygon by polygon
-    sizes : corners of each polygon
+    number : index of the mesh among those shown
+    is_used : (C,) bool array, which of the mesh's corners belong to polygons
+    corners : (c,) int64 array, vertices of those corners, polygon by polygon
+    sizes : number of corners of each polygon
     faces : (F, 3) int64 array, triangles of vertices
-    polygon_of, material_of : (F,) int64 arrays, of each triangle
+    polygon_of, material_of : (F,) int64 arrays, polygon and material of each triangle
     """
 
     number: int
@@ -81,14 +81,14 @@ class Laid:
 
 
 class FbxLooks:
-    """Reads how the meshes of one file look.
+    """Reads the appearance of the meshes of one file.
 
-    What is missing or damaged is left out, and noted.
+    Missing or damaged values are left out with a note.
 
     Parameters
     ----------
     ask : returns the arrays of `fbx_worker`
-    path : of the file; textures may lie beside it
+    path : path of the file, beside which textures may lie
     """
 
     def __init__(self, ask: Callable[[], dict[str, Any]], path: Path) -> None:
@@ -100,7 +100,7 @@ class FbxLooks:
 
     @cached_property
     def _materials(self) -> tuple[list[Material], list[str]]:
-        """The materials of the file, and notes."""
+        """The materials of the file, the last without texture, and notes."""
         images, notes = ImageReader(), list[str]()
         textures: list[Texture | None] = []
         for number, name in enumerate(self._found["textures"].tolist()):
@@ -109,7 +109,7 @@ class FbxLooks:
             ]
             try:
                 data = self._found[f"content {number}"].tobytes() or self._beside(name)
-                # FBX counts v from below.
+                # FBX has v = 0 at the bottom.
                 pixels = images.read(data, f"the texture {quoted(name)}")
                 textures.append(Texture(pixels, (wraps[0], wraps[1]), file=data))
             except MeshFileError as error:
@@ -119,7 +119,7 @@ class FbxLooks:
         return [Material(texture) for texture in [*own, None]], notes
 
     def _beside(self, name: str) -> bytes:
-        """Read a file that programs look for by its name, wherever the artist had it."""
+        """Read a texture file by name, beside the FBX file or in usual folders."""
         file = name.replace("\\", "/").rpartition("/")[2]
         folder = self._path.parent
         for place in (folder, folder / f"{self._path.stem}.fbm", folder / "textures"):
@@ -131,7 +131,7 @@ class FbxLooks:
         raise MeshFileError("is not beside the file", where=f"the texture {quoted(name)}")
 
     def appearance(self, laid: Laid, *, shaded: bool = False) -> Appearance:
-        """Read how a mesh looks, with its normals if it is `shaded`; those split points too."""
+        """Read the appearance of a mesh; if `shaded`, with normals, which split points too."""
         looks, (materials, notes) = self._found, self._materials
         faces = laid.faces_of_corners()
         prefix, n = f"{laid.number} ", len(laid.corners)
@@ -141,14 +141,14 @@ class FbxLooks:
         colours = np.ones((n, 4))
         if prefix + "colours" in looks:
             colours = looks[prefix + "colours"][laid.is_used]
-        # The last is for faces without one.
+        # The last material is for faces without one.
         numbers = np.append(looks[prefix + "materials"], len(materials) - 1)
         chosen = np.where(laid.material_of < len(numbers) - 1, laid.material_of, -1)
         material_of = numbers[chosen]
         # All triangles of a polygon have its material.
         of_corner = np.zeros(n, dtype=np.int64)
         of_corner[faces] = material_of[:, None]
-        # A texture takes the place of its material's colour.
+        # A texture replaces the colour of its material.
         base = np.concatenate([looks["colours"], np.ones((1, 3))])
         base[[material.texture is not None for material in materials]] = 1.0
         colours[:, :3] = colours[:, :3] * base[of_corner]
@@ -159,7 +159,7 @@ class FbxLooks:
         if shaded and prefix + "normals" in looks:
             normals = looks[prefix + "normals"][laid.is_used]
             normals = normals if np.isfinite(normals).all() else np.zeros((n, 0))
-        # What corners have in common is drawn once.
+        # Merge equal corners into one point.
         alike = np.column_stack([laid.corners, uv, painted, normals])
         _, kept, point_of = np.unique(alike, axis=0, return_index=True, return_inverse=True)
         return Appearance(
@@ -175,7 +175,7 @@ class FbxLooks:
 
 
 _MOST_MEMORY = 1 << 32
-"""Address space of the process that reads, in bytes, where the system can limit it."""
+"""Limit of the reading process's address space in bytes, if the system supports it."""
 
 _MOST_SECONDS = 300
 _POLL_SECONDS = 0.1
@@ -185,17 +185,17 @@ _UNKNOWN_AXIS = 6
 _MOST_FRAMES = 1_000_000
 _USUAL_RATE = 24.0
 _SAME_FRAME = 0.01
-"""Frames by which a clip's length may differ from a whole number of them: times are written in
-ticks, rates with three digits, and a clip may have a thousand frames."""
+"""Largest difference, in frames, of a clip's length from a whole number of frames: times are stored
+in ticks, rates with three digits, and a clip may have a thousand frames."""
 
 _NTSC_ROUNDING = 2e-4
-"""What 23.98 lies from 24/1.001, relatively; 24 lies five times as far."""
+"""Relative difference of 23.98 from 24/1.001; 24 differs five times as much."""
 
 
 def read_shown(source: FbxDocument) -> Scene:
-    """Read what the file shows.
+    """Read the scene of the file.
 
-    Vertices are the file's control points, in its order of nodes. A clip's own frames are those of
+    Vertices are the file's control points, in the order of its nodes. A clip's own frames are at
     the file's frame rate.
 
     Raises
@@ -238,7 +238,7 @@ def read_shown(source: FbxDocument) -> Scene:
 
 
 def read_nodes(source: FbxDocument) -> Scene:
-    """Read the nodes and what moves them, whether they show a mesh or not.
+    """Read the nodes and the clips that move them, with or without meshes.
 
     Raises
     ------
@@ -274,13 +274,13 @@ def _frame(held: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class FbxDocument:
-    """The bytes of a file, and what ufbx says of them, until the job is cancelled.
+    """The bytes of an FBX file, which ufbx reads in a process that the job can cancel.
 
     Attributes
     ----------
-    data : of the file
-    path : where it is; images may lie beside it
-    job : polled while it is read, and its clips sampled
+    data : bytes of the file
+    path : its path, beside which images may lie
+    job : polled while it is read and its clips are sampled
     """
 
     data: bytes
@@ -289,13 +289,13 @@ class FbxDocument:
 
     @property
     def has_skin(self) -> bool:
-        """Whether it names clusters of a skin; the names of its objects are never compressed."""
+        """Whether it has clusters of a skin; names of objects are never compressed."""
         return b"Cluster" in self.data
 
     def asked(
         self, clip: int | None = None, times: FloatArray | None = None, looks: bool = False
     ) -> dict[str, Any]:
-        """Return the arrays of `fbx_worker`."""
+        """Return the arrays of `fbx_worker` for a request."""
         if find_spec("ufbx") is None:
             raise MissingExtraError(
                 "reading FBX needs the package ufbx, which is not installed",
@@ -319,7 +319,7 @@ class FbxDocument:
             raise MeshFileError("it is a damaged FBX file, on which its reader crashed") from error
 
     def _run(self, request: bytes) -> tuple[int, bytes, bytes]:
-        """Return the exit status of the process that reads, what it found, and what it said."""
+        """Return the exit status, output and error output of the reading process."""
         with subprocess.Popen(
             [sys.executable, "-P", str(_WORKER)],
             stdin=subprocess.PIPE,
@@ -351,7 +351,7 @@ class FbxDocument:
 
 @dataclass(frozen=True, eq=False)
 class _FbxClip:
-    """Samples an animation of a file; `parts` are those of its meshes that have faces."""
+    """Samples an animation of a file; `parts` are the meshes that have faces."""
 
     source: FbxDocument
     clip: int
@@ -376,14 +376,14 @@ def _clips(source: FbxDocument, held: dict[str, Any], parts: tuple[int, ...]) ->
 
 
 def _frame_times(name: str, start: float, end: float, said: float) -> FloatArray:
-    """Return the times of a clip's frames, of which the last is its end where one is there.
+    """Return the times of a clip's frames, the last at its end if that is a frame.
 
-    Files say 29.97 for 30/1.001 frames a second: the rate that fits the clip's length better
-    counts. A rate of three digits would lead away from the frames of a long clip.
+    Files store 29.97 for 30/1.001 frames per second: the rate that better fits the clip's length is
+    used. The rounded rate would drift away from the frames of a long clip.
 
     Raises
     ------
-    MeshFileError : there would be too many, or the times are no numbers.
+    MeshFileError : there would be too many frames, or the times are not finite.
     """
     said = said if 0.0 < said < np.inf else _USUAL_RATE
     ntsc = round(1.001 * said) / 1.001
@@ -401,7 +401,7 @@ def _frame_times(name: str, start: float, end: float, said: float) -> FloatArray
 
 
 def _only(held: dict[str, Any], number: int) -> dict[str, Any]:
-    """Return the arrays of one mesh."""
+    """Return the arrays of one mesh, without their prefix."""
     prefix = f"{number} "
     return {name[len(prefix) :]: held[name] for name in held if name.startswith(prefix)}
 
@@ -414,7 +414,7 @@ def _part(
     looks: FbxLooks,
     notes: list[str],
 ) -> Part | None:
-    """Return one mesh where a node shows it; None without faces."""
+    """Return the part for a mesh shown by a node; None if it has no faces."""
     sizes, is_face = held["faces"][:, 1], held["faces"][:, 1] >= 3
     is_used = np.repeat(is_face, sizes)
     corners = held["corners"][is_used]
@@ -431,7 +431,7 @@ def _part(
     bones, bind = held["bones"], held["bind"]
     bone_of, weights = _influences(held, len(points))
     if len(bones) > 1 and bone_of[weights > 0.0].all():
-        # No vertex follows the node itself.
+        # No vertex follows the node itself, so drop it.
         bones, bind, bone_of = bones[1:], bind[1:], np.maximum(bone_of - 1, 0)
     if int(held["skins"]) > 1:
         notes.append("of the several skins of a mesh only the first was read")
@@ -461,7 +461,7 @@ def _part(
 
 
 def _influences(held: dict[str, Any], n_vertices: int) -> tuple[npt.NDArray[np.int32], FloatArray]:
-    """Return the bones and weights of each vertex; the node itself, number 0, of those without."""
+    """Return the bones and weights of each vertex; unweighted ones follow the node, bone 0."""
     if "shares" not in held:
         return np.zeros((n_vertices, 1), dtype=np.int32), np.ones((n_vertices, 1))
     vertices, movers, shares = held["moved"], held["movers"], held["shares"]
@@ -481,7 +481,7 @@ def _influences(held: dict[str, Any], n_vertices: int) -> tuple[npt.NDArray[np.i
 
 
 def _sliders(held: dict[str, Any]) -> dict[str, FloatArray]:
-    """Return `Part.sliders`: those of the blend shapes."""
+    """Return `Part.sliders`, one for each blend shape."""
     names = [name or f"shape {n}" for n, name in enumerate(held["shapes"].tolist(), 1)]
     return dict(zip(numbered_where_equal(names), np.eye(len(names)), strict=True))
 

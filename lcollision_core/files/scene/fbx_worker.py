@@ -1,10 +1,10 @@
-"""Reads one FBX file by ufbx; run as a process of its own, so that a crash ends it alone.
+"""Read one FBX file by ufbx, as a process of its own that may crash.
 
-The bindings of ufbx count references to a scene's objects wrongly, so that they end the process
-when an object is asked for twice and then released; and a hostile file may do so, or fill the
-memory. What goes in by standard input is one line of JSON (`clip` and `times` to sample, or `looks`
-for colours and textures, or none of them; `most_memory` in bytes, `most_elements`), then the file.
-What comes out is an .npz archive, or one line of reason at standard error and status 3.
+The bindings of ufbx miscount references to a scene's objects and crash when an object is accessed
+twice and then released; a hostile file may crash them too, or exhaust the memory. Standard input is
+one line of JSON (`clip` and `times` to sample, or `looks` for colours and textures, or neither;
+`most_memory` in bytes, `most_elements`), followed by the file. The output is an .npz archive, or a
+one-line reason on standard error and status 3.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ import ufbx
 REFUSED = 3
 
 _ANIMATED = ("Lcl ", "DeformPercent", "Geometric", "RotationPivot", "ScalingPivot")
-"""How the names of properties begin whose change moves vertices."""
+"""Prefixes of the names of properties that move vertices."""
 
 
 _TIME_MODE_119_88 = 18
-"""A rate that ufbx does not know: it takes it for 24."""
+"""A rate that ufbx does not know and reads as 24."""
 
 _BARE = (ufbx.ElementType.UNKNOWN, ufbx.ElementType.EMPTY, ufbx.ElementType.BONE)
-"""What nodes are that show nothing."""
+"""Types of nodes that show nothing."""
 
 
 class _TooLargeError(Exception):
@@ -39,7 +39,7 @@ class _TooLargeError(Exception):
 
 
 def _kept(item: Any) -> Any:
-    """Count a reference more, so that an object of ufbx lives as long as the process."""
+    """Add a reference, so that an object of ufbx lives as long as the process."""
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(item))
     return item
 
@@ -51,7 +51,7 @@ def _items(items: Any) -> Iterator[Any]:
 
 
 def _array(items: Any, dtype: type, width: int | None = None) -> np.ndarray:
-    """Copy a list of numbers; an empty one of ufbx has no type."""
+    """Copy a list of numbers; an empty list of ufbx has no type."""
     kept = _kept(items)
     if not len(kept):
         return np.empty((0,) if width is None else (0, width), dtype)
@@ -60,7 +60,7 @@ def _array(items: Any, dtype: type, width: int | None = None) -> np.ndarray:
 
 def _matrix(matrix: Any) -> np.ndarray:
     result = np.eye(4)
-    # Column by column.
+    # Column-major.
     result[:3] = np.array(matrix).T
     return result
 
@@ -105,9 +105,9 @@ def _frames_per_second(settings: Any) -> float:
 
 
 def _shown(nodes: list[Any]) -> Iterator[tuple[Any, Any]]:
-    """Yield the nodes with a mesh that are seen, of levels of detail the finest, and their meshes.
+    """Yield the visible nodes with a mesh, at the finest level of detail, and their meshes.
 
-    A file whose meshes are all hidden shows them all.
+    If all meshes of a file are hidden, all count as visible.
     """
     shown = [(node, mesh) for node in nodes if (mesh := _kept(node.mesh)) is not None]
     seen = [pair for pair in shown if pair[0].visible] or shown
@@ -129,12 +129,12 @@ def _unseen(nodes: list[Any], shown: list[tuple[Any, Any]]) -> list[str]:
 
 
 def _cached(shown: list[tuple[Any, Any]]) -> list[str]:
-    """Return the names of the nodes whose mesh a geometry cache beside the file moves."""
+    """Return the names of the nodes whose mesh is moved by a geometry cache beside the file."""
     return [node.name for node, mesh in shown if len(_kept(mesh.cache_deformers))]
 
 
 def _clips(scene: Any) -> Iterator[tuple[Any, set[int]]]:
-    """Yield the animations that move something, with the nodes that they move."""
+    """Yield the animations that move vertices, with the nodes that they move."""
     for stack in _items(scene.anim_stacks):
         moved: set[int] = set()
         is_moving = False
@@ -150,7 +150,7 @@ def _clips(scene: Any) -> Iterator[tuple[Any, set[int]]]:
 
 
 def _span(stack: Any) -> tuple[float, float]:
-    """Return when an animation begins and ends; as its curves do where the file does not say it."""
+    """Return the start and end of an animation; those of its curves if the file lacks them."""
     if stack.time_end > stack.time_begin:
         return stack.time_begin, stack.time_end
     curves = [
@@ -182,7 +182,7 @@ def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
     part["skins"] = np.array(len(skins))
     for skin in skins[:1]:
         if skin.skinning_method != ufbx.SkinningMethod.LINEAR or skin.num_dq_weights:
-            # Numbers of the first weight and of weights, and the share of dual quaternions.
+            # Columns: first weight, number of weights, and share of dual quaternions.
             part["dual"] = np.clip(_array(skin.vertices, np.float64, 3)[:, 2], 0.0, 1.0)
         clusters = [
             (bone, cluster)
@@ -205,7 +205,7 @@ def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
     for number, shape in enumerate(shapes):
         part[f"changed {number}"] = _array(shape.offset_vertices, np.int64)
         offsets = _array(shape.position_offsets, np.float64, 3).reshape(-1, 3)
-        # Blender writes the vertex group that masks a shape key.
+        # Blender stores the vertex group that masks a shape key as weights.
         mask = _array(shape.offset_weights, np.float64)
         part[f"offsets {number}"] = offsets * mask[:, None] if len(mask) else offsets
     part["weights"] = _weights(mesh)
@@ -214,7 +214,7 @@ def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
 
 
 def _looks(scene: Any) -> dict[str, np.ndarray]:
-    """Return the materials, what they and their textures are, and what lies on the corners."""
+    """Return the materials, their textures, and the UVs, colours and normals of the corners."""
     colours: list[np.ndarray] = []
     texture_of: list[int] = []
     names: list[str] = []
@@ -269,7 +269,7 @@ def _shapes(mesh: Any) -> Iterator[Any]:
 
 
 def _shape_names(mesh: Any) -> list[str]:
-    """Return the names of the channels; of one with shapes in between, the names of these."""
+    """Return the names of the channels; for one with in-between shapes, the shapes' names."""
     names: list[str] = []
     for deformer in _items(mesh.blend_deformers):
         for channel in _items(deformer.channels):
@@ -305,12 +305,12 @@ def _limit_memory(n_bytes: int) -> None:
     except ImportError:  # Windows
         return
     resource.setrlimit(resource.RLIMIT_AS, (n_bytes, n_bytes))
-    # A crash is expected of some files, and needs no dump.
+    # Some files are expected to crash ufbx, so write no core dumps.
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def main() -> int:
-    """Read from standard input, write to standard output, and return the status."""
+    """Read standard input, write standard output, and return the exit status."""
     gc.disable()
     asked = json.loads(sys.stdin.buffer.readline())
     _limit_memory(asked["most_memory"])
@@ -322,7 +322,7 @@ def main() -> int:
                 load_external_files=False,
                 clean_skin_weights=True,
                 skip_mesh_parts=True,
-                # Not by its name, and no other format than FBX.
+                # Accept only FBX, whatever the content looks like.
                 file_format=ufbx.FileFormat.FBX,
             )
         )

@@ -1,4 +1,4 @@
-"""The parts of a scene as one mesh, whose vertices at seams are joined."""
+"""Join the parts of a scene, and their vertices at seams, to one mesh."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ IntArray = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class _Morphs:
-    """Morph targets of some vertices: `part` weighs (M, n, 3) `deltas` of the n `vertices`."""
+    """Morph targets of n `vertices`: (M, n, 3) `deltas` with the weights of `part`."""
 
     part: int
     vertices: IntArray
@@ -33,24 +33,24 @@ class _Morphs:
 
 @dataclass(frozen=True, eq=False)
 class JoinedMesh:
-    """One mesh of all parts of a scene; vertices that no pose can separate are one.
+    """One mesh of all parts of a scene; vertices that no pose can separate are joined.
 
     Those are vertices with the same coordinates, bones, weights and morph deltas.
 
     Attributes
     ----------
-    topology : of the V joined vertices, numbered by first appearance; faces that joining makes
-        degenerate, and those without area at rest, are left out
+    topology : topology of the V joined vertices, numbered by first appearance; without faces that
+        joining makes degenerate or that have no area at rest
     cut_of : (F,) int64 array, ascending, the polygon that each face was cut from
-    joined : (W,) int64 array: the joined vertex of each of the parts' W vertices
-    bones : (B,) int64 array, nodes that move vertices; a node may be there several times
+    joined : (W,) int64 array, the joined vertex of each of the parts' W vertices
+    bones : (B,) int64 array, nodes that move vertices; a node may occur several times
     bind : (B, 4, 4) float64 array, from the vertices' coordinates to each bone's
-    bone_of : (V, I) int32 array, indices into `bones`, ascending, then those of no weight
+    bone_of : (V, I) int32 array, indices into `bones`, ascending, then those without weight
     weights : (V, I) float64 array >= 0, each row sums to 1
     points : (V, 3) float64 array, in the coordinates of each vertex's part
     is_skinned : (V,) bool array
-    dual : (V,) float64 array, the share that dual quaternions have of the blend
-    morphs : what adds to `points`
+    dual : (V,) float64 array, share of dual quaternions in the blend
+    morphs : morph targets, which are added to `points`
     groups : named meshes and materials, at most `MAX_GROUPS`
     notes : sentences on what was changed
     """
@@ -70,7 +70,7 @@ class JoinedMesh:
     notes: tuple[str, ...]
 
     def cut_as(self, topology: Topology | None) -> JoinedMesh:
-        """Return the same mesh, its polygons cut as a topology was cut from them, if it was."""
+        """Return the mesh with the triangulation of `topology`, if that has the same polygons."""
         if (
             topology is None
             or topology.n_vertices != self.topology.n_vertices
@@ -80,7 +80,7 @@ class JoinedMesh:
         return replace(self, topology=topology)
 
     def morphed(self, weights: tuple[FloatArray, ...]) -> FloatArray:
-        """Return the (V, 3) points with the morph targets of the parts, of (M,) weights, added."""
+        """Return the (V, 3) points with morph targets applied, for (M,) weights of each part."""
         points = self.points.copy()
         for morphs in self.morphs:
             used = np.flatnonzero(weights[morphs.part])
@@ -97,7 +97,7 @@ class JoinedMesh:
 
         Parameters
         ----------
-        poses : of the scene
+        poses : poses of the scene
         job : reports (poses done, N); polled between poses
 
         Returns
@@ -125,24 +125,24 @@ class JoinedMesh:
 
     @property
     def _blend(self) -> sparse.csr_matrix:
-        """(V, B) the weights."""
+        """Return the weights as a (V, B) matrix."""
         n_vertices = self.topology.n_vertices
         rows = np.repeat(np.arange(n_vertices), self.bone_of.shape[1])
         entries = (self.weights.reshape(-1), (rows, self.bone_of.reshape(-1)))
         return sparse.csr_matrix(entries, (n_vertices, len(self.bones)))
 
     def _blended(self, blend: sparse.csr_matrix, transforms: FloatArray) -> FloatArray:
-        """Return the (V, 3, 4) map of each vertex, for (nodes, 4, 4) transforms."""
+        """Return the (V, 3, 4) affine maps of the vertices, for (nodes, 4, 4) transforms."""
         turns = transforms[self.bones] @ self.bind
         blended = (blend @ turns[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
         return self._with_dual_quaternions(blended, turns)
 
     def linear_parts(self, transforms: FloatArray) -> FloatArray:
-        """Return what turns each vertex's deltas where one of its bones has it: (V, I, 3, 3).
+        """Return the (V, I, 3, 3) linear maps of each vertex by each of its bones alone.
 
         Parameters
         ----------
-        transforms : (nodes, 4, 4) of a pose; dual quaternions turn by all bones at once
+        transforms : (nodes, 4, 4) of a pose; dual quaternions give the blend of all bones instead
         """
         turns: FloatArray = (transforms[self.bones] @ self.bind)[self.bone_of, :3, :3]
         rows = np.flatnonzero(self.dual)
@@ -151,7 +151,7 @@ class JoinedMesh:
         return turns
 
     def _with_dual_quaternions(self, blended: FloatArray, turns: FloatArray) -> FloatArray:
-        """Replace the share of (V, 3, 4) linear blends that is not linear."""
+        """Mix dual quaternion blends into (V, 3, 4) linear blends, by their shares."""
         rows = np.flatnonzero(self.dual)
         if not len(rows):
             return blended
@@ -164,19 +164,19 @@ class JoinedMesh:
 def sample_clip(
     scene: Scene, name: str, fps: float | FloatArray | None, n_vertices: int = 0
 ) -> tuple[FloatArray, ScenePoses]:
-    """Return the frames of a clip, as `Clip.times` chooses them.
+    """Sample the frames of a clip, at times chosen by `Clip.times`.
 
     Parameters
     ----------
-    scene : of the clip
-    name : the clip's
-    fps : frames a second; None for the clip's keys; or the (N,) times themselves
-    n_vertices : of which each frame is to have the coordinates; 0 for its transforms alone
+    scene : scene of the clip
+    name : name of the clip
+    fps : frames per second; None for the clip's keys; or the (N,) times themselves
+    n_vertices : number of vertices per frame, for the size limit; 0 for transforms only
 
     Returns
     -------
     times : (N,) float64 array, in seconds
-    poses : N of the scene
+    poses : N poses of the scene
 
     Raises
     ------
@@ -198,7 +198,7 @@ def sample_clip(
 
 
 def look_of(scene: Scene, mesh: JoinedMesh) -> Appearance | None:
-    """Read how a scene looks, on the vertices of its mesh; None where its file does not say that.
+    """Read the appearance of a scene on its joined mesh; None if the file does not define it.
 
     Raises
     ------
@@ -215,7 +215,7 @@ def join_parts(scene: Scene) -> JoinedMesh:
 
     Raises
     ------
-    MeshFileError : no face is left.
+    MeshFileError : no face with area is left.
     """
     parts = scene.parts
     first_vertex = np.cumsum([0] + [len(part.points) for part in parts])
@@ -225,14 +225,14 @@ def join_parts(scene: Scene) -> JoinedMesh:
     dual = np.concatenate(
         [np.zeros(len(part.points)) if part.dual is None else part.dual for part in parts]
     )
-    # -0.0 becomes 0.0: equal numbers, equal bits.
+    # Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal bits.
     places = np.column_stack([points, dual]) + 0.0
     keys = np.concatenate(
         [places.view(np.int64), bone_of, weights.view(np.int64), morph_of], axis=1
     )
     kept, joined = _first_of_equal(keys)
     faces = np.concatenate([joined[part.faces + first_vertex[i]] for i, part in enumerate(parts)])
-    # Numbers that ascend are enough.
+    # The numbers of polygons need only ascend.
     n_before = np.cumsum([0] + [len(part.faces) for part in parts])
     cut_of = np.concatenate(
         [
@@ -264,7 +264,7 @@ def join_parts(scene: Scene) -> JoinedMesh:
         (),
         (),
     )
-    # Of corners in a line, or all in one place.
+    # Faces with collinear or coincident corners.
     flat = degenerate_faces(mesh.topology, mesh.posed(scene.rest)[0])
     is_flat[np.flatnonzero(~is_flat)[flat]] = True
     notes = list(scene.notes)
@@ -295,11 +295,11 @@ def _topology(faces: IntArray, is_left_out: npt.NDArray[np.bool_], n_vertices: i
 
 
 def _common_bones(parts: tuple[Part, ...]) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
-    """Give the bones of all parts common numbers, and sort each vertex's by them.
+    """Give the bones of all parts common numbers, and sort those of each vertex.
 
     Returns
     -------
-    bones, bind : as of `JoinedMesh`; no two rows are the same
+    bones, bind : see `JoinedMesh`; no two pairs are equal
     bone_of : (W, I) int64 array, 0 where the weight is 0
     weights : (W, I) float64 array
     """
@@ -324,7 +324,7 @@ def _common_bones(parts: tuple[Part, ...]) -> tuple[IntArray, FloatArray, IntArr
         columns = part.bone_of.shape[1]
         weights[rows, :columns] = part.weights
         bone_of[rows, :columns] = np.where(part.weights > 0.0, numbers[part.bone_of], 0)
-    # Those without weight last, as number 0.
+    # Those without weight come last, with number 0.
     order = np.argsort(np.where(weights > 0.0, bone_of, len(bones)), axis=1, kind="stable")
     bone_of = np.take_along_axis(bone_of, order, axis=1)
     weights = np.take_along_axis(weights, order, axis=1)
@@ -332,7 +332,7 @@ def _common_bones(parts: tuple[Part, ...]) -> tuple[IntArray, FloatArray, IntArr
 
 
 def _morph_numbers(parts: tuple[Part, ...]) -> IntArray:
-    """Return (W, 2) numbers, equal where vertices have the same morph deltas: 0, 0 for none."""
+    """Return (W, 2) numbers that are equal for vertices with equal morph deltas; 0, 0 for none."""
     result = [np.zeros((len(part.points), 2), dtype=np.int64) for part in parts]
     # The parts that one node shows share their weights.
     for node in {part.node for part in parts}:
@@ -355,7 +355,7 @@ def _morph_numbers(parts: tuple[Part, ...]) -> IntArray:
 
 
 def _first_of_equal(rows: npt.NDArray[np.integer]) -> tuple[IntArray, IntArray]:
-    """Return the first of each kind of equal rows, ascending, and each row's kind among them."""
+    """Return the first of each set of equal rows, ascending, and the set of each row."""
     flat = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1])))
     _, first, which = np.unique(flat[:, 0], return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -365,7 +365,7 @@ def _first_of_equal(rows: npt.NDArray[np.integer]) -> tuple[IntArray, IntArray]:
 
 
 def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tuple[FaceGroup, ...]:
-    """Return the faces of each mesh, and of each material; of one name only once."""
+    """Return the faces of each mesh and material, merged by name."""
     number = np.cumsum(~is_left_out) - 1
     start = 0
     faces_of: dict[str, list[IntArray]] = {}

@@ -1,4 +1,4 @@
-"""What a file of a scene holds, whatever its format: nodes, parts that they move, and clips."""
+"""The content of a scene file in any format: nodes, parts that they move, and clips."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from lcollision_core.files.scene.transforms import are_regular, is_regular
 from lcollision_core.meshes.topology import FloatArray
 
 MAX_FRAME_NUMBERS = 1 << 28
-"""The most coordinates, and the most numbers of node transforms, that the frames of a clip have."""
+"""Most coordinates, and most numbers of node transforms, in the frames of a clip."""
 
 MOST_KEYS_PER_SECOND = 30.0
-"""Keys that follow faster are no frames of their own."""
+"""Keys that follow faster are not frames of their own."""
 
 LEAST_RATE = 20.0
-"""Keys a second, below which a clip is taken to move between its keys."""
+"""Keys per second below which a clip is assumed to move between its keys."""
 
 _LEAST_STEP = 1e-3
-"""Seconds between keys, below which they are one step."""
+"""Shortest time between keys, in seconds, that counts as a step."""
 
 _SAME_FRAME = 1e-2
-"""Of the step from frame to frame, by which a key may be off and still be the frame's."""
+"""Largest deviation of a key from its frame, as a fraction of a frame."""
 
 _MOST_FRAMES = 1_000_000
 _NAMED = 3
-"""Meshes that a note names."""
+"""Most names that a note lists."""
 
 NO_MESH = (
     "it contains an animation, but no mesh",
     "name or open the character that it is to move, or export it with its mesh (on some sites: "
     "with skin)",
 )
-"""What is wrong with a file of an animation alone where a mesh is needed, and what helps."""
+"""Problem and advice for a file with only an animation when a mesh is needed."""
 
 
 class NoMeshError(MeshFileError):
-    """A file holds an animation alone."""
+    """A file has an animation but no mesh."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class ScenePoses:
     weights: tuple[FloatArray, ...]
 
     def part(self, pose: int) -> ScenePoses:
-        """Return one of the poses alone."""
+        """Return a single pose."""
         chosen = slice(pose, pose + 1)
         return ScenePoses(
             self.transforms[chosen], tuple(of_part[chosen] for of_part in self.weights)
@@ -69,7 +69,7 @@ class ScenePoses:
 
 @dataclass(frozen=True)
 class Primitive:
-    """What a part is in a glTF file: numbers of its description, and how many there are."""
+    """A part's primitive in a glTF file: indices in its description, and counts."""
 
     node: int
     mesh: int
@@ -82,34 +82,35 @@ class Primitive:
 class Part:
     """Triangles of one mesh, moved by nodes.
 
-    In a pose whose nodes have the global transforms G, vertex v, its morph deltas added, is
-    sum_i weights[v, i] G_b bind[j] points[v] with j = bone_of[v, i] and b = bones[j].
+    In a pose whose nodes have the global transforms G, vertex v is
+    sum_i weights[v, i] G_b bind[j] points[v] with j = bone_of[v, i] and b = bones[j], where points
+    include morph deltas.
 
     Attributes
     ----------
-    mesh : its name: of the node that shows it, as artists see it, else of the mesh
-    materials : names
-    material_of : (F,) int64 array, each face's material; what is no index is none
+    mesh : name of the node that shows it, as artists see it, else of the mesh
+    materials : names of materials
+    material_of : (F,) int64 array, each face's material; none if out of range
     node : the node that shows it
     points : (W, 3) float64 array
-    faces : (F, 3) int64 array, indices from 0 into the part's vertices, checked
-    bones : (B,) int64 array, nodes; the node itself where nothing is skinned
+    faces : (F, 3) int64 array, checked indices into the part's vertices
+    bones : (B,) int64 array of nodes; the node itself if nothing is skinned
     bind : (B, 4, 4) float64 array, from the part's coordinates to each bone's
     bone_of : (W, I) int32 array, indices into `bones`
     weights : (W, I) float64 array >= 0, each row sums to 1
     is_skinned : whether the bones are joints of a skin
-    morphs : (M, W, 3) float32 array, what each morph target adds
-    sliders : by the names that artists know, the (M,) weights that each adds to those at rest: that
-        of one morph target, or of an expression all that it binds
-    is_single : whether the file holds the points as float32
-    dual : (W,) float64 array, the share in [0, 1] that dual quaternions have of the blend; None
-        where it is linear, as above
-    look : reads how it looks, which takes long; None where its file does not say that
-    shaded_look : the same with the normals, which split points too; None where `look` is, or the
-        file can be written itself
-    cut_of : (F,) int64 array, ascending, the polygon that each face was cut from; None where each
-        is one
-    primitive : that it is in a glTF file; None in another
+    morphs : (M, W, 3) float32 array, deltas of each morph target
+    sliders : (M,) weights that each slider adds to those at rest, by name: of one morph target, or
+        of all that an expression binds
+    is_single : whether the file stores the points as float32
+    dual : (W,) float64 array, share in [0, 1] of dual quaternions in the blend; None for linear
+        blending as above
+    look : reads the appearance, which is slow; None if the file does not define it
+    shaded_look : the same with normals, which split points too; None without `look`, or if the file
+        itself can be written
+    cut_of : (F,) int64 array, ascending, the polygon that each face was cut from; None if the
+        polygons are the faces
+    primitive : its primitive in a glTF file; None for other formats
     """
 
     mesh: str
@@ -139,10 +140,10 @@ class Clip:
 
     Attributes
     ----------
-    name : unique in the scene
+    name : unique name in the scene
     moved : the nodes that it moves, without those that follow them
-    read_key_times : makes `key_times`, which may read the file's arrays
-    sample : from (N,) times to the N poses then
+    read_key_times : returns `key_times`, and may read the file's arrays
+    sample : returns the N poses at (N,) times
     """
 
     name: str
@@ -162,16 +163,16 @@ class Clip:
 
     @property
     def rate(self) -> float:
-        """Keys a second, by the usual step between them, where there are enough.
+        """Keys per second, from the median step between them.
 
-        A clip of fewer than `LEAST_RATE` keys a second moves between them: its rate is
+        A clip with fewer than `LEAST_RATE` keys per second moves between them, so its rate is
         `MOST_KEYS_PER_SECOND`.
         """
         steps = np.diff(self.key_times)
         steps = steps[steps > _LEAST_STEP]
         usual = np.median(steps) if len(steps) else np.inf
-        # Keys are stored in single precision: the mean of many steps is right even late in a long
-        # clip, and 1 / 24 s is 24 a second only nearly.
+        # Keys are stored in single precision: the mean of many steps is accurate even late in a
+        # long clip, but 1 / 24 s must be rounded to 24 per second.
         alike = steps[np.abs(steps - usual) < 0.05 * usual]
         rate = 1.0 / float(alike.mean()) if len(alike) else 0.0
         nearest = float(round(rate))
@@ -179,20 +180,20 @@ class Clip:
         return rate if rate >= LEAST_RATE else MOST_KEYS_PER_SECOND
 
     def times(self, fps: float | None) -> FloatArray:
-        """Return the times of its frames.
+        """Return the times of the clip's frames.
 
         Parameters
         ----------
-        fps : frames a second from the first key to the last; None for the keys themselves, without
-            those that follow another faster than `MOST_KEYS_PER_SECOND`
+        fps : frames per second from the first key to the last; None for the keys themselves,
+            without those that follow faster than `MOST_KEYS_PER_SECOND`
 
         Raises
         ------
-        MeshFileError : fps is no number above 0, or there would be too many frames.
+        MeshFileError : fps is not a number above 0, or there would be too many frames.
         """
         start, end = float(self.key_times[0]), float(self.key_times[-1])
         if fps is None:
-            # Keys are stored in single precision: a thousandth of a step is no difference.
+            # Keys are stored in single precision, so tolerate a thousandth of a step.
             least_step = (1.0 - 1e-3) / MOST_KEYS_PER_SECOND
             kept = [start]
             for time in self.key_times[1:].tolist():
@@ -201,7 +202,7 @@ class Clip:
             return np.array(kept)
         if not 0.0 < fps < np.inf:
             raise MeshFileError.must_be("fps", "a number above 0", f"{fps:g}")
-        # Keys are stored in single precision: a hundredth of a frame is no difference.
+        # Keys are stored in single precision, so tolerate a hundredth of a frame.
         n_steps = (end - start) * fps + _SAME_FRAME
         if not n_steps < _MOST_FRAMES:
             raise MeshFileError(
@@ -210,7 +211,7 @@ class Clip:
                 "choose fewer frames a second",
             )
         times = start + np.arange(int(n_steps) + 1) / fps
-        # Just before a key, a value that steps would be the one of the key before.
+        # Move times to nearby keys: just before a key, a stepped value is still the previous one.
         middles = 0.5 * (self.key_times[1:] + self.key_times[:-1])
         nearest = self.key_times[np.searchsorted(middles, times)]
         return np.where(np.abs(nearest - times) < _SAME_FRAME / fps, nearest, times)
@@ -222,21 +223,21 @@ class Scene:
 
     Attributes
     ----------
-    node_names : as in the file, "" where it has none; of a VRM avatar's bones what they are
-    parents : (n,) int64 array, each node's parent, -1 for a root; no circles
-    rest : the one pose in which the file stores the nodes
-    parts : in the order of the file's meshes, then of the nodes that show each, then of its
-        primitives
+    node_names : names in the file, empty if there is none; standard names for a VRM avatar's bones
+    parents : (n,) int64 array, each node's parent, -1 for a root; no cycles
+    rest : the single pose in which the file stores the nodes
+    parts : ordered by the file's meshes, then the nodes that show each, then its primitives
     clips : its animations
-    up : (3,) float64 array, a signed unit axis; None where the file does not say it
+    up : (3,) float64 array, a signed unit axis; None if the file does not define it
     metres : length of the file's unit
     notes : sentences on what was left out
-    unscaled : nodes that their parents' scale does not reach, as by Maya's segment scale compensate
-    revealed : nodes that the rest pose has elsewhere than the file's, parents first
-    showing : nodes that show something; said where the nodes alone were read
-    bound : of nodes that carry the largest skin their (4, 4) transforms in its bind pose, in axes
-        that they have in common; said where the nodes alone were read
-    document : the `GltfDocument`; None for a file of another format
+    unscaled : nodes that do not inherit their parent's scale, as with Maya's segment scale
+        compensate
+    revealed : nodes whose rest transforms differ from the file's, parents first
+    showing : nodes that show something; only set if just the nodes were read
+    bound : (4, 4) transforms of the largest skin's nodes in its bind pose, in common axes; only set
+        if just the nodes were read
+    document : the `GltfDocument`; None for other formats
     """
 
     node_names: tuple[str, ...]
@@ -255,7 +256,7 @@ class Scene:
 
 
 def by_node(parts: Sequence[Part], values: Sequence[FloatArray]) -> dict[int, FloatArray]:
-    """Return (N, M) values by morph target of the node that shows each part: the longest."""
+    """Return the (N, M) morph target values of each node, the longest of its parts."""
     found: dict[int, FloatArray] = {}
     for part, own in zip(parts, values, strict=True):
         if own.shape[1] > found.get(part.node, own[:, :0]).shape[1]:
@@ -264,10 +265,10 @@ def by_node(parts: Sequence[Part], values: Sequence[FloatArray]) -> dict[int, Fl
 
 
 def character_parts(scene: Scene) -> list[int]:
-    """Return which parts are of the characters of a scene; of one without skins all are.
+    """Return the indices of the parts that belong to characters; all in a scene without skins.
 
-    Floors, backdrops and other scenery are not: no joint carries them, and no clip moves them, not
-    even by what carries the whole skeleton.
+    Floors, backdrops and other scenery do not: no joint carries them, and no clip moves them, other
+    than by nodes above the skeleton.
     """
     joints = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
 
@@ -288,7 +289,7 @@ def character_parts(scene: Scene) -> list[int]:
 
 
 def with_parts(scene: Scene, kept: Sequence[int], why: str) -> Scene:
-    """Return a scene with some of its parts, and a note on why the others are left out."""
+    """Return a scene with the `kept` parts, and a note on why the others are left out."""
     if len(kept) == len(scene.parts):
         return scene
 
@@ -310,7 +311,7 @@ def with_parts(scene: Scene, kept: Sequence[int], why: str) -> Scene:
 
 
 def left_out_note(what: str, names: Iterable[str]) -> str:
-    """Return a sentence that names what something is true of, some of them where they are many."""
+    """Return a note followed by names, of which only the first few are listed."""
     different = list(dict.fromkeys(names))
     more = f" and {len(different) - _NAMED} more" if len(different) > _NAMED else ""
     return f"{what}: {', '.join(different[:_NAMED])}{more}"
@@ -338,11 +339,11 @@ def parents_first(parents: npt.NDArray[np.int64]) -> list[int]:
 def bind_pose(
     skins: Iterable[tuple[npt.NDArray[np.integer], FloatArray]],
 ) -> dict[int, FloatArray]:
-    """Return `Scene.bound`, of the skin with the most bones.
+    """Return `Scene.bound` for the skin with the most bones.
 
     Parameters
     ----------
-    skins : the nodes (B,) that carry each, and the (B, 4, 4) inverses of where these are in it
+    skins : for each skin, its (B,) nodes and their (B, 4, 4) inverse bind matrices
     """
     most = max(skins, key=lambda skin: len(skin[0]), default=None)
     pairs = () if most is None else zip(*most, strict=True)
@@ -350,32 +351,32 @@ def bind_pose(
 
 
 def is_mirrored(turns: FloatArray, bone_of: npt.NDArray[np.int32], weights: FloatArray) -> bool:
-    """Whether most weight is of bones that turn faces inside out.
+    """Whether bones that mirror the faces have most of the weight.
 
     Parameters
     ----------
     turns : (B, 4, 4) array, from a part's coordinates to the scene's by each bone
     bone_of, weights : of the part
     """
-    # Too large a number is refused where the vertices are.
+    # Numbers that are too large are refused with the vertices.
     with np.errstate(all="ignore"):
         signs = np.sign(np.linalg.det(turns[:, :3, :3]))
     return bool((signs[bone_of] * weights).sum() < 0.0)
 
 
 _HIDDEN = 1e-3
-"""Of the scale that a clip gives a node: what is scaled to less along an axis is hidden."""
+"""Least scale along an axis, relative to that in a clip, of a node that is not hidden."""
 
 _INVISIBLE = 1e-5
-"""Of the size of a scene's largest part: what is smaller is not seen."""
+"""Least size of a visible part, relative to the largest part of the scene."""
 
 _MOST_FRAMES_SAMPLED = 1000
 
 
 def shown_scene(scene: Scene) -> Scene:
-    """Show at rest what a clip shows, and leave out scenery and what is never seen; notes say so.
+    """Show at rest parts that a clip shows, and leave out scenery and invisible parts, with notes.
 
-    Faces of a part that is scaled to nothing have no area, so its rest pose could not be checked.
+    The faces of a part of zero scale have no area, so its rest pose could not be checked.
     """
     carriers = _carriers(scene)
     for node in parents_first(scene.parents):
@@ -386,7 +387,7 @@ def shown_scene(scene: Scene) -> Scene:
 
 
 def _carriers(scene: Scene) -> set[int]:
-    """Return the nodes that move parts, and those above them."""
+    """Return the nodes that move parts, and their ancestors."""
     carriers: set[int] = set()
     for part in scene.parts:
         for bone in part.bones.tolist():
@@ -397,7 +398,7 @@ def _carriers(scene: Scene) -> set[int]:
 
 
 def _revealed(scene: Scene, node: int) -> Scene:
-    """Place a node as a clip does, with all below it, if the rest pose alone hides it by scale."""
+    """Place a node and its descendants as in a clip if only the rest pose hides it by scale."""
     rest = scene.rest.transforms
     parent = int(scene.parents[node])
     above = np.eye(4) if parent < 0 else rest[0, parent]
@@ -411,13 +412,13 @@ def _revealed(scene: Scene, node: int) -> Scene:
                 every = len(clip.key_times) // _MOST_FRAMES_SAMPLED + 1
                 transforms = clip.sample(clip.key_times[::every]).transforms
             except MeshFileError:
-                continue  # A damaged clip is refused where it is asked for.
+                continue  # A damaged clip is refused when it is used.
             scales = _least_scale(transforms, node, parent).tolist()
             frames += zip(scales, [clip.name] * len(scales), transforms, strict=True)
     greatest = max((scale for scale, _, _ in frames), default=0.0)
     if not least < _HIDDEN * greatest:
         return scene
-    # Not one of those in which it just grows, or beyond its size.
+    # Choose a median frame, not one in which the node just grows or overshoots.
     shown = sorted(
         (frame for frame in frames if frame[0] >= 0.5 * greatest), key=lambda one: one[0]
     )
@@ -433,7 +434,7 @@ def _revealed(scene: Scene, node: int) -> Scene:
     note = f"hidden at rest by its scale, shown as in the clip {clip_name!r}"
     joints = {bone for part in parts if part.is_skinned for bone in part.bones.tolist()}
     if not joints.isdisjoint(_ancestors(scene, node)):
-        # What is only shown and hidden is carried by the joint that it hangs on.
+        # A node that a clip only shows and hides is carried by its joint.
         clips = tuple(replace(clip, moved=clip.moved - {node}) for clip in scene.clips)
         scene = replace(scene, clips=clips)
     return replace(
@@ -457,7 +458,7 @@ def _above(transforms: FloatArray, parent: int) -> FloatArray:
 
 
 def _least_scale(transforms: FloatArray, node: int, parent: int) -> FloatArray:
-    """Return the (N,) least scales of a node relative to its parent; 0 where that has none."""
+    """Return the (N,) least scales of a node relative to its parent; 0 if that is singular."""
     above = np.broadcast_to(_above(transforms, parent), (len(transforms), 4, 4))
     regular = are_regular(above)
     least = np.zeros(len(transforms))
@@ -467,7 +468,7 @@ def _least_scale(transforms: FloatArray, node: int, parent: int) -> FloatArray:
 
 
 def _wound(part: Part, before: FloatArray, after: FloatArray, moved: Sequence[int]) -> Part:
-    """Return a part whose faces look outwards as some of its nodes are placed now."""
+    """Return a part with its faces flipped if moving its nodes has mirrored it."""
     if set(part.bones.tolist()).isdisjoint(moved):
         return part
     was, is_now = (
@@ -478,9 +479,10 @@ def _wound(part: Part, before: FloatArray, after: FloatArray, moved: Sequence[in
 
 
 def _seen_parts(scene: Scene) -> list[int]:
-    """Return which parts are not scaled to nothing at rest; all where none is seen.
+    """Return the indices of the parts that are visible at rest; all if none is.
 
-    Beside a skinned body, what is flat and on nothing that is not could not be posed.
+    Beside a skinned body, leave out unskinned parts whose nodes are all singular, as they could not
+    be posed.
     """
     rest = scene.rest.transforms[0]
     sizes = np.array([_largest_size(part, rest) for part in scene.parts])
@@ -493,10 +495,10 @@ def _seen_parts(scene: Scene) -> list[int]:
 
 
 def _largest_size(part: Part, transforms: FloatArray) -> float:
-    """Return a bound of how large a part is."""
+    """Return an upper bound of the size of a part."""
     used = np.unique(part.bone_of[part.weights > 0.0])
     turns = transforms[part.bones[used]] @ part.bind[used]
-    # Too large a number is refused where the vertices are.
+    # Numbers that are too large are refused with the vertices.
     with np.errstate(over="ignore", invalid="ignore"):
         spread = np.linalg.norm(np.ptp(turns @ np.append(part.points.mean(axis=0), 1.0), axis=0))
         sizes = np.linalg.norm(turns[:, :3, :3], axis=(1, 2)) * np.linalg.norm(

@@ -1,4 +1,4 @@
-"""SMPL, SMPL-H and SMPL-X: body models in .npz files of plain arrays."""
+"""Read SMPL, SMPL-H and SMPL-X body models from .npz files of plain arrays."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lcollision_core.files.table import SMPL_SUFFIX
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 PICKLE_SUFFIXES = (".pkl", ".pickle")
-"""Extensions of what is never opened, because loading it can run code."""
+"""Extensions of files that are never opened, because loading them can run code."""
 
 _SIDES = ("left", "right")
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
@@ -49,18 +49,18 @@ JOINT_NAMES: dict[int, tuple[str, ...]] = {
 """The joints of SMPL, SMPL-H and SMPL-X, in the order of their poses."""
 
 _SMPLX, _SHAPES_OF_SMPLX, _FEWER_SHAPES = 55, 300, 10
-"""SMPL-X's shape directions are 300, or 10, before those of expressions."""
+"""SMPL-X has 300 or 10 shape directions, followed by those of expressions."""
 
 _LARGEST = 1e6
 _SUM = 1e-3
-"""By which the weights of a vertex may miss 1."""
+"""Largest deviation of a vertex's sum of weights from 1."""
 
 _AS_PLAIN = (
     "where you trust the file, save its arrays as plain numbers: numpy.savez('model.npz', "
     "**{name: numpy.array(model[name]) for name in ('v_template', 'shapedirs', 'posedirs', "
     "'weights', 'kintree_table', 'f')}, J_regressor=model['J_regressor'].toarray())"
 )
-"""What helps where a model is pickled, as it is often distributed."""
+"""Advice for a pickled model, as models are often distributed."""
 
 _REGRESSOR, _SPARSE = "J_regressor", ("data", "indices", "indptr", "row", "col")
 _HAND_ARRAYS = [f"hands_{what}{side[0]}" for what in ("components", "mean") for side in _SIDES]
@@ -72,18 +72,18 @@ class SmplModel:
 
     Attributes
     ----------
-    path : of its file
+    path : path of its file
     names : J names of the joints
     parents : (J,) int64 array, -1 for the pelvis, which is the first; parents come before children
-    topology : of its V vertices
+    topology : topology of its V vertices
     template : (V, 3) float64 array, the mean shape
-    shape_directions : (V, 3, S) float64 array, what each number of the shape (beta) adds
-    pose_directions : (V, 3, 9 (J - 1)) float32 array, what each entry of R - I adds, of the
+    shape_directions : (V, 3, S) float64 array, offsets by each number of the shape (beta)
+    pose_directions : (V, 3, 9 (J - 1)) float32 array, offsets by each entry of R - I, for the
         rotations R of all joints but the first, row by row
     regressor : (J, V) sparse array, from the vertices of a shape to its joints
     weights : (V, J) float64 array >= 0, each row sums to 1
-    hands : of each hand, where the file has them, (45, 45) principal components of its poses, a
-        component a row, and the (45,) mean
+    hands : for each hand, if the file has them, (45, 45) principal components of its poses, one
+        per row, and the (45,) mean
     """
 
     path: Path
@@ -102,19 +102,19 @@ class SmplModel:
 
         Parameters
         ----------
-        betas : (n,) array, n of at most S
+        betas : (n,) array, n <= S
         """
         vertices: FloatArray = self.template + self.shape_directions[..., : len(betas)] @ betas
         return vertices, self.regressor @ vertices
 
 
 def is_smpl_model(path: str | os.PathLike[str]) -> bool:
-    """Whether an .npz file holds a body model, not poses of one; it raises nothing."""
+    """Whether an .npz file is a body model, not poses of one; never raises."""
     return "v_template" in array_names(path)
 
 
 def array_names(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Return what an .npz file says its arrays are; nothing of any other file."""
+    """Return the names of the arrays in an .npz file; none for any other file."""
     if Path(path).suffix.lower() != SMPL_SUFFIX:
         return ()
     try:
@@ -128,7 +128,7 @@ def refuse_pickle(path: str | os.PathLike[str]) -> None:
 
     Raises
     ------
-    MeshFileError : it is one.
+    MeshFileError : it is a pickle.
     """
     if Path(path).suffix.lower() in PICKLE_SUFFIXES:
         raise MeshFileError(
@@ -141,8 +141,8 @@ def read_smpl(path: str | os.PathLike[str]) -> SmplModel:
 
     Raises
     ------
-    MeshFileError : the file is missing, damaged, holds Python objects or something else, or has
-        other joints. The sentence names the file.
+    MeshFileError : the file is missing, damaged, has Python objects or other content, or has other
+        joints. The message names the file.
     """
     wanted = ("v_template", "shapedirs", "posedirs", "weights", "kintree_table", "f", _REGRESSOR)
     sparse = [f"{_REGRESSOR}_{part}" for part in _SPARSE]
@@ -171,7 +171,7 @@ def _model(
     if n_joints not in JOINT_NAMES:
         raise MeshFileError(f"it has {n_joints} joints, expected {_joined(JOINT_NAMES)}")
     parents = table[0].astype(np.int64)
-    # The pelvis has none: the largest unsigned number, or -1.
+    # The pelvis has no parent: the file stores the largest unsigned number, or -1.
     parents[0] = -1
     if (parents[1:] < 0).any() or (parents[1:] >= np.arange(1, n_joints)).any():
         raise MeshFileError("one of its joints comes before its parent")
@@ -207,7 +207,7 @@ def _model(
 
 
 def _regressor(arrays: dict[str, npt.NDArray[Any]], n_joints: int, n: int) -> csr_array:
-    """Return the (J, V) matrix, which is stored whole, or its entries by rows, columns or pairs."""
+    """Return the (J, V) matrix, which is stored densely or in CSR, CSC or COO form."""
     if _REGRESSOR in arrays:
         return csr_array(_floats(arrays, _REGRESSOR, (n_joints, n)))
     if f"{_REGRESSOR}_data" not in arrays:
@@ -239,7 +239,7 @@ def _floats(
 ) -> FloatArray:
     with np.errstate(all="ignore"):
         array = _plain(arrays, name, "f", shape).astype(np.float64)
-    # Comparing with NaN is false.
+    # Comparisons with NaN are false.
     if not (np.abs(array) <= _LARGEST).all():
         raise MeshFileError("has a number that cannot be used", where=f"its array {name!r}")
     return array
@@ -248,11 +248,11 @@ def _floats(
 def _plain(
     arrays: Mapping[str, npt.NDArray[Any]], name: str, kinds: str, shape: tuple[int | None, ...]
 ) -> npt.NDArray[Any]:
-    """Return an array of some kinds of numbers and of a shape, of which None is any size above 0.
+    """Return an array with one of the dtype kinds and a shape, in which None is any size above 0.
 
     Raises
     ------
-    MeshFileError : it is missing, or another.
+    MeshFileError : it is missing, or has another dtype or shape.
     """
     if name not in arrays:
         raise _missing(name)

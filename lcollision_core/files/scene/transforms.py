@@ -1,4 +1,4 @@
-"""Affine transforms of nodes, chains of them, and skinning by dual quaternions."""
+"""Affine transforms of nodes, their hierarchies, and dual quaternion skinning."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 from lcollision_core.meshes.topology import FloatArray
 
 _NEARLY_PARALLEL = 1.0 - 1e-9
-"""Cosine above which the arc between two quaternions is taken for its chord."""
+"""Cosine above which the arc between two quaternions is approximated by its chord."""
 
 
 def compose(translation: FloatArray, rotation: FloatArray, scale: FloatArray) -> FloatArray:
@@ -19,7 +19,7 @@ def compose(translation: FloatArray, rotation: FloatArray, scale: FloatArray) ->
     Parameters
     ----------
     translation, scale : (..., 3) arrays
-    rotation : (..., 4) array, quaternions x, y, z, w of any length; one of length 0 rotates nothing
+    rotation : (..., 4) array, quaternions x, y, z, w of any length; length 0 is the identity
 
     Returns
     -------
@@ -48,8 +48,8 @@ def compose(translation: FloatArray, rotation: FloatArray, scale: FloatArray) ->
 def decompose(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the translation, rotation (x, y, z, w) and scale of (..., 4, 4) affine matrices.
 
-    A reflection is in the scale of x, shear is lost, and what has no scale along an axis does not
-    rotate.
+    A reflection goes to the scale of x, shear is lost, and a matrix with zero scale along an axis
+    has no rotation.
     """
     from scipy.spatial.transform import Rotation
 
@@ -68,7 +68,7 @@ def is_regular(transform: FloatArray) -> bool:
 
 
 def are_regular(transforms: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return the (...) answers of `is_regular` to (..., 4, 4) transforms."""
+    """Apply `is_regular` to (..., 4, 4) transforms, (...)."""
     columns = transforms[..., :3, :3]
     lengths = np.linalg.norm(columns, axis=-2)
     spans: npt.NDArray[np.bool_] = np.abs(np.linalg.det(columns)) > 1e-9 * lengths.prod(axis=-1)
@@ -76,7 +76,7 @@ def are_regular(transforms: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def slerp(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
-    """Interpolate (..., 4) unit quaternions along the shorter arc by (...) shares of it."""
+    """Interpolate (..., 4) unit quaternions along the shorter arc by (...) fractions of it."""
     cosine = np.einsum("...i,...i->...", start, end)
     end = np.where(cosine[..., None] < 0.0, -end, end)
     cosine = np.minimum(np.abs(cosine), 1.0)
@@ -90,11 +90,11 @@ def slerp(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
 
 
 def signs_on_one_side(rotations: FloatArray) -> FloatArray:
-    """Return by which sign each of (T, ...) is on the side of its neighbour, as the first is.
+    """Return the signs that make successive quaternions take the shorter arc; the first is 1.
 
     Parameters
     ----------
-    rotations : (T, ..., 4) quaternions; between those on one side the shorter arc lies
+    rotations : (T, ..., 4) quaternions
 
     Returns
     -------
@@ -107,9 +107,9 @@ def signs_on_one_side(rotations: FloatArray) -> FloatArray:
 
 
 def nearest_winding(turns: FloatArray, near: FloatArray) -> FloatArray:
-    """Return of all rotation vectors (..., 3) that turn the same the ones nearest to others.
+    """Return the (..., 3) rotation vectors equivalent to `turns` that are nearest to `near`.
 
-    What is nearest already is to the bit what it was.
+    Vectors that are nearest already stay exactly equal.
     """
     angle = np.linalg.norm(turns, axis=-1, keepdims=True)
     direction = np.divide(turns, angle, out=np.zeros_like(turns), where=angle > 0.0)
@@ -123,7 +123,7 @@ def global_transforms(
 ) -> FloatArray:
     """Chain (N, n, 4, 4) local transforms of n nodes; `order` has parents before children."""
     result = local.copy()
-    # Too large a number is refused where the vertices are.
+    # Numbers that are too large are refused with the vertices.
     with np.errstate(over="ignore", invalid="ignore"):
         for node in order:
             if parents[node] >= 0:
@@ -134,11 +134,11 @@ def global_transforms(
 def blend_dual_quaternions(
     turns: FloatArray, bone_of: npt.NDArray[np.integer], weights: FloatArray
 ) -> FloatArray:
-    """Return the transform of each vertex between those of its bones.
+    """Blend the transforms of each vertex's bones.
 
     Parameters
     ----------
-    turns : (B, 4, 4) float64 array, how the bones move the vertices
+    turns : (B, 4, 4) float64 array, transforms of the bones
     bone_of, weights : (V, I) arrays, each row of weights sums to 1
 
     Returns
@@ -155,7 +155,7 @@ def blend_dual_quaternions(
     moves, rotations, scales = (np.stack(some) for some in zip(*parts, strict=True))
     real = rotations[bone_of]
     dual = 0.5 * _product(np.pad(moves, ((0, 0), (0, 1)))[bone_of], real)
-    # All on the side of the bone of most weight: a quaternion and its negative are one rotation.
+    # q and -q are the same rotation: take the sign nearest to the bone of most weight.
     main = np.take_along_axis(real, weights.argmax(axis=1)[:, None, None], axis=1)
     shares = weights * np.where((real * main).sum(axis=-1) < 0.0, -1.0, 1.0)
     blended = np.einsum("vi,vik->vk", shares, real)
@@ -167,7 +167,7 @@ def blend_dual_quaternions(
 
 
 def _product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the product of quaternions x, y, z, w."""
+    """Return the products of quaternions x, y, z, w."""
     vectors = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + np.cross(a[..., :3], b[..., :3])
     scalars = a[..., 3:] * b[..., 3:] - (a[..., :3] * b[..., :3]).sum(axis=-1, keepdims=True)
     return np.concatenate([vectors, scalars], axis=-1)
