@@ -511,7 +511,7 @@ def test_the_radius_of_grips_has_limits(document: PoseDocument) -> None:
 
 @pytest.fixture
 def seen(solid: PoseDocument) -> Iterator[list[tuple[bool, bool]]]:
-    """Yield, for each shown frame, whether a separate check finds collisions, and has contacts."""
+    """Record whether each shown frame collides, by a separate check, and if it has contacts."""
     shown: list[tuple[bool, bool]] = []
 
     def look() -> None:

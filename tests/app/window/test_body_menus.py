@@ -1,4 +1,4 @@
-"""The menu of the body: what it offers for the part under the pointer, and the camera's icons."""
+"""The body's context menu: its entries for the part under the pointer, and the camera's icons."""
 
 from __future__ import annotations
 
@@ -90,12 +90,12 @@ def test_the_rest_of_the_menu_is_made_of_the_window_s_own_actions(
 def test_the_menu_opens_again_after_it_is_closed(window: MainWindow) -> None:
     for _ in range(3):
         window.viewport.menu_wanted.emit(1, None, window.mapToGlobal(QPoint(500, 300)))
-        # A search of the window's children would hide what is tested: it wraps them anew.
+        # Searching the window's children would hide the bug: it creates new wrappers.
         menu = QApplication.activePopupWidget()
         assert isinstance(menu, QMenu)
         assert chosen(menu, "Camera view").isEnabled()
         menu.close()
-        # What is closed is deleted, and takes nothing of the window along.
+        # A closed menu is deleted, without anything of the window.
         QApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
 
 

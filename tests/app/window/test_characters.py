@@ -187,7 +187,7 @@ def test_poses_of_a_character_are_saved_and_recovered_with_it(
     assert '"arm"' in (tmp_path / "poses.json").read_text()
     with qtbot.waitSignal(autosave.written, timeout=PATIENCE):
         document.motion.set_code(code, 0.5)
-        # What is on its way there is written too.
+        # Pending changes are written, too.
         qtbot.waitUntil(lambda: not document.motion.moving)
     assert autosave.close(keep=True)
     assert document.close()
@@ -304,7 +304,7 @@ def test_a_joint_is_what_the_menu_of_its_slider_says(
 
 
 def test_a_greyed_action_says_why(qtbot: QtBot, tmp_path: Path, arm_file: Path) -> None:
-    """Of a body whose one arm has no other side, and of none."""
+    """For a body whose only arm has no other side, and without a body."""
     window = MainWindow(PoseDocument(library_folder=tmp_path), settings_in(tmp_path))
     window.show()
     actions = window.actions_by_key

@@ -1,4 +1,4 @@
-"""A pose or a limb is copied and pasted: with locks, by undo, never into another body."""
+"""Copying and pasting a pose or a limb: with locks, with undo, never into another body."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_pose_and_a_limb_of_it_are_pasted(window: MainWindow, body: RigBody) -
     assert document.history.undo_stack.undoText() == "Paste pose"
     document.history.undo()
     assert not document.history.latent.any()
-    # One arm alone: all of it, and nothing else.
+    # Only one arm: all of it, and nothing else.
     forearm = vertex_of(body, "Left forearm")
     choose(window, forearm, "Paste into limb")
     moved = document.history.latent != 0.0
@@ -68,7 +68,7 @@ def test_a_pose_and_a_limb_of_it_are_pasted(window: MainWindow, body: RigBody) -
     assert not moved[body.space.codes_of([body.domain_names.index("Right forearm")])].any()
     np.testing.assert_array_equal(document.history.latent[moved], held[moved])
     assert moved[body.space.codes_of([body.domain_names.index("Left upper arm")])].all()
-    # What is copied of a limb is pasted there, by Ctrl+V too.
+    # A copied limb is pasted to the same limb, also by Ctrl+V.
     choose(window, forearm, "Copy limb")
     document.motion.reset_all()
     document.motion.set_locked(body.domain_names.index("Left forearm"), True)
@@ -96,7 +96,7 @@ def test_what_is_no_pose_of_this_body_is_refused(
         QGuiApplication.clipboard().setMimeData(data)
         with pytest.raises(LCollisionError, match="there is no pose on the clipboard"):
             paste_pose(window.document)
-    # A text field keeps its own keys.
+    # A text field handles its own keys.
     QGuiApplication.clipboard().setText("shoulder")
     window.sliders.filter.setFocus()
     QTest.keyClick(window.sliders.filter, Qt.Key.Key_V, CTRL)

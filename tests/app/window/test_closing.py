@@ -1,4 +1,4 @@
-"""The window closes: what it waits for, what it asks, and that nothing of it is left."""
+"""Closing the window: waiting, questions, and complete clean-up."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_closing_waits_for_what_is_being_exported(window: MainWindow, tmp_path: 
     export_pose(document, tmp_path / "no such folder" / "pose.obj")
     export_pose(document, tmp_path / "pose.obj")
     waiting = answer(look)
-    # One fails, which is told; the other is written all the same.
+    # One fails, which is reported; the other is still written.
     assert not window.close()
     assert not waiting.isActive()
     assert asked == ["Finishing 3 exports…"]
@@ -140,7 +140,7 @@ def test_told_to_end_it_closes_from_under_an_open_question(window: MainWindow) -
 
 
 def test_nothing_is_left_open(window: MainWindow) -> None:
-    """Closing by the menu, with nothing to save, asks nothing."""
+    """Closing by the menu with nothing to save asks no question."""
     window.actions_by_key["quit"].trigger()
     assert not window.isVisible()
     assert window.document.close()
@@ -148,7 +148,7 @@ def test_nothing_is_left_open(window: MainWindow) -> None:
 
 
 def test_a_closed_window_is_deleted_at_once(qtbot: QtBot, window: MainWindow) -> None:
-    """The garbage collector takes widgets apart in any order, which Qt does not survive."""
+    """The garbage collector deletes widgets in any order, which crashes Qt."""
     with qtbot.waitSignal(window.destroyed, timeout=PATIENCE):
         window.actions_by_key["quit"].trigger()
     assert not isValid(window)

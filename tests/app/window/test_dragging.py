@@ -1,4 +1,4 @@
-"""Dragging in a real window: Solid, pins, patches, and what holds a pose."""
+"""Dragging in a real window: Solid, pins, patches, and holding a pose."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def body_window(qtbot: QtBot, body_window: MainWindow) -> MainWindow:
 
 
 def arrived(qtbot: QtBot, window: MainWindow) -> None:
-    """Wait until what is dragged goes no further."""
+    """Wait until the dragged patch comes to rest."""
     qtbot.waitUntil(lambda: not window.document.motion.moving, timeout=2 * PATIENCE)
 
 
@@ -106,7 +106,7 @@ def test_a_key_pins_what_is_under_the_pointer_and_types_into_a_field(
     assert document.history.pose.pins == ()
     QTest.mouseMove(canvas, QPoint(3, 3))
     qtbot.waitUntil(lambda: not pin.isEnabled(), timeout=PATIENCE)
-    # The small model's parts are named after neither.
+    # The small model has no parts of these names.
     for key, word in (("pin_feet", "feet"), ("pin_hands", "hands")):
         assert not window.actions_by_key[key].isEnabled()
         assert word in window.actions_by_key[key].toolTip()
@@ -155,7 +155,7 @@ def test_feet_and_hands_are_pinned_in_one_step(qtbot: QtBot, body_window: MainWi
         body_window.actions_by_key[key].trigger()
         pinned = {names[space.vertex_domain[pin.vertex]] for pin in document.history.pose.pins}
         assert pinned == {name for name in names if word in name}
-        # Heels do not swing through the floor: two vertices more keep the orientation.
+        # Heels must not swing through the floor: two more vertices keep the orientation.
         assert all(len(pin.frame) == 2 for pin in document.history.pose.pins)
         assert document.history.undo_stack.count() == 1
         document.history.undo()
@@ -174,7 +174,7 @@ def test_a_slider_shows_where_contact_holds_it(qtbot: QtBot, body_window: MainWi
         qtbot.wait(16)
     arrived(qtbot, body_window)
     reached = float(document.history.latent[code])
-    # The handle stays under the pointer, the number says what the pose has.
+    # The handle stays under the pointer; the number shows the pose's value.
     assert row.slider.number < reached - 0.01
     assert row.slider.held_at is not None
     assert row.field.value() == pytest.approx(reached, abs=1e-3)
@@ -243,7 +243,7 @@ def test_a_part_is_mirrored_to_the_other_side_by_the_menu(
     before = document.history.latent
     menu = body_window._body_menus.part_menu(left, None)
     (mirror,) = (a for a in menu.actions() if "irror to" in a.text().replace("&", ""))
-    # An edit that still moves the pose ends where it is.
+    # An unfinished edit ends at its present pose.
     assert document.model.space.metric.any()
     document.motion.randomise(1.0, 3)
     qtbot.waitUntil(lambda: document.history.latent is not before)
@@ -269,7 +269,7 @@ def test_the_menu_bar_pins_the_patch_that_the_pointer_left(
     point_at(qtbot, viewport, vertex)
     QApplication.sendEvent(viewport.canvas, QEvent(QEvent.Type.Leave))
     assert not pin.isEnabled()
-    # The key is for what is under the pointer.
+    # The key applies to the patch under the pointer.
     QTest.keyClick(window, Qt.Key.Key_P)
     assert document.history.pose.pins == ()
     menu.popup(window.mapToGlobal(QPoint(60, 30)))
@@ -348,7 +348,7 @@ def test_a_drag_hints_at_what_else_can_be_done_and_says_that_the_body_helps(
         QTest.mouseRelease(canvas, LEFT, NO_KEY, place + QPoint(16, 0))
         arrived(qtbot, window)
         assert status.currentMessage() == ""
-    # Not in the next window.
+    # But not in the next window.
     again = PoseDocument()
     set_up_drags(again.motion, window.settings)
     assert not again.motion.whole_body

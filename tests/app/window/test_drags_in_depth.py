@@ -1,4 +1,4 @@
-"""Drags of a character nearer and farther, along arrows, and while its feet stand."""
+"""Drags of a character in depth, along arrows, and with standing feet."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def domain_of(window: MainWindow, name: str) -> int:
 
 
 def middle(window: MainWindow, name: str) -> npt.NDArray[np.float64]:
-    """Return the normalised (3,) middle of a body part as it is shown."""
+    """Return the normalised (3,) middle of a body part as shown."""
     model = window.document.model
     inside = model.space.vertex_domain == domain_of(window, name)
     held: npt.NDArray[np.float64] = shown(window)[inside].mean(axis=0) / model.body_size
@@ -119,7 +119,7 @@ def test_a_hand_is_dragged_along_an_arrow(qtbot: QtBot, stage: MainWindow) -> No
     assert stage.viewport.mouse is not None
     patch = stage.document.motion.grip_at(vertex).vertices
     beside = seen_vertex(stage.viewport, domain_of(stage, "right hand"), set(patch) - {vertex})
-    # The patch that has the arrows takes them away, wherever it is pointed at.
+    # Toggling at the patch with the arrows removes them, wherever the pointer is on it.
     for place, shown_at in ((beside, beside), (vertex, None), (vertex, vertex)):
         point_at(qtbot, stage.viewport, place)
         QTest.keyClick(stage, Qt.Key.Key_A)
@@ -143,7 +143,7 @@ def test_a_hand_is_dragged_along_an_arrow(qtbot: QtBot, stage: MainWindow) -> No
         rest(qtbot, stage)
         way = stage.document.motion.grip_at(vertex).position(shown(stage)) - before
         way = way / model.body_size
-        # An arm that is stretched out swings a little, and may settle short of the 0.08.
+        # A stretched arm swings a little, and may settle short of 0.08.
         assert 0.03 < way @ axis < 0.1
         assert np.linalg.norm(way - (way @ axis) * axis) < 0.02
     point_beside(qtbot, stage.viewport)

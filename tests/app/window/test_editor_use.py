@@ -1,4 +1,4 @@
-"""The editor around its main story: crashes, themes, the keyboard, no display, and long use."""
+"""The editor beyond its main workflow: crashes, themes, keyboard, no display, long use."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ THEMES = pytest.mark.parametrize(
 
 @pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep settings, log and sessions of this process and of those that it starts in a folder."""
+    """Keep settings, log and sessions of this process and its children in a separate folder."""
     for name in ("XDG_CONFIG_HOME", "XDG_STATE_HOME", "XDG_DATA_HOME"):
         monkeypatch.setenv(name, str(tmp_path / name))
     return tmp_path
@@ -70,7 +70,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def signals() -> Iterator[None]:
-    """Give the signals that an editor takes back to those who had them."""
+    """Restore the signal handlers that an editor replaces."""
     held = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     yield
     for number, handler in held.items():
@@ -79,7 +79,7 @@ def signals() -> Iterator[None]:
 
 @pytest.fixture
 def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    """Start a real editor; one that still runs after the test is killed."""
+    """Start a real editor; kill it if it still runs after the test."""
     started = []
 
     def run(*arguments: object) -> subprocess.Popen[str]:
@@ -100,7 +100,7 @@ def body() -> LearnedBody:
 
 
 def wait_until(editor: subprocess.Popen[str], happened: Callable[[], bool], what: str) -> None:
-    """Wait for what an editor does once it runs; it may have to compile before."""
+    """Wait for an event of a running editor, which may have to compile first."""
     deadline = time.monotonic() + 4 * PATIENCE / 1000
     while not happened():
         if time.monotonic() > deadline or editor.poll() is not None:
@@ -187,7 +187,7 @@ def test_it_opens_on_the_built_in_body_and_ends_when_told_to(
 
 
 def share_of_height(window: MainWindow) -> float:
-    """Return how much of the view's height the pose on the screen takes."""
+    """Return the share of the view's height that the shown pose fills."""
     canvas = window.viewport.canvas
     assert canvas is not None
     places = [on_screen(canvas, vertex).y() for vertex in shown(window)]
@@ -216,7 +216,7 @@ def test_it_opens_with_the_camera_on_its_first_pose_and_then_steps_back_only(
     rest(qtbot, window)
     assert settings["model"] == "body"
     assert document.history.pose.name == ("kneeling" if opens_a_mesh else kneeling.name)
-    # It was half before, framed as the standing body.
+    # It was half before, framed for the standing body.
     assert 0.62 < share_of_height(window) < 0.85
     view = window.viewport.scene.view
     document.motion.begin_gesture("Drag")
@@ -227,7 +227,7 @@ def test_it_opens_with_the_camera_on_its_first_pose_and_then_steps_back_only(
     after = window.viewport.scene.view
     assert view is not None
     assert after is not None
-    # The standing body would not be seen whole from there: only as far back as that takes.
+    # The camera moves back only as far as showing the whole standing body needs.
     assert window.viewport.shown_frame is not None
     vertices = window.viewport.shown_frame.vertices
     aspect = window.viewport.width() / window.viewport.height()
@@ -290,7 +290,7 @@ def test_without_a_display_one_sentence_names_what_works_there(words: tuple[str,
     hidden = ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM")
     environment = {key: value for key, value in os.environ.items() if key not in hidden}
     if words == ("wayland",):
-        # With a display for X, and no compositor.
+        # With an X display but no Wayland compositor.
         environment |= {"DISPLAY": os.environ.get("DISPLAY", ":0"), "QT_QPA_PLATFORM": "wayland"}
         words = ()
     ended = subprocess.run(
@@ -329,7 +329,7 @@ def test_what_is_read_stands_out_from_what_is_behind_it(theme: Theme) -> None:
         for ink in (theme.text, theme.muted, theme.free, theme.colliding, theme.waiting):
             assert contrast(QColor(ink), QColor(behind)) >= 4.5, (ink, behind)
     assert contrast(QColor(theme.on_accent), QColor(theme.accent)) >= 4.5
-    # The signs and bars beside the words need less.
+    # The signs and bars beside the words need less contrast.
     assert contrast(QColor(theme.accent), QColor(theme.card)) >= 3.0
 
 
@@ -368,7 +368,7 @@ def menu_actions(menu: QMenu) -> Iterator[QAction]:
 def test_every_action_is_in_a_menu_and_has_a_shortcut_of_its_own(window: MainWindow) -> None:
     entries = [action for menu in window.menus.values() for action in menu_actions(menu)]
     without = {action.text() for action in entries if not action.shortcuts()}
-    # One slip from Ctrl+U, it would change the model's file.
+    # A slip from Ctrl+U would change the model's file.
     assert without == {"No files yet", "Turn &upright"}
     named = [action for action in entries if action.shortcuts()]
     keyed = {held for key, held in window.actions_by_key.items() if key != "upright"}
@@ -412,7 +412,7 @@ def test_the_window_s_shortcuts_work_while_a_field_has_the_keyboard(
     fired: list[str] = []
     window.document.motion.set_code(1, 0.5)
     for action in window.actions_by_key.values():
-        # Told by its key alone: most of what it would do opens a dialog.
+        # Only test the key: most actions open a dialog.
         action.triggered.disconnect()
         action.triggered.connect(
             lambda _, action=action: fired.append(action.shortcut().toString())
@@ -595,11 +595,11 @@ def test_the_benchmark_measures_a_session_of_its_own(
     assert np.isfinite(row["leak_mb"])
     numbers = {name: row[name] for name in row if name.endswith(("_ms", "_seconds", "_mb", "_cpu"))}
     del numbers["leak_mb"]
-    assert numbers.pop("open_seconds") is None  # of a character alone
+    assert numbers.pop("open_seconds") is None  # only for characters
     assert all(0.0 <= number < np.inf for number in numbers.values()), numbers
     assert 0.0 < row["decode_ms"] < row["event_p95_ms"]
     assert row["event_p50_ms"] <= row["event_p95_ms"]
-    # The parts of a move are within it: both medians are of the same moves.
+    # The parts are contained in a move: the medians are over the same moves.
     parts = ("update_ms", "render_ms", "compose_ms", "overhead_p50_ms")
     assert max(row[part] for part in parts) <= row["event_p95_ms"]
     assert min(row[part] for part in parts) > 0.0

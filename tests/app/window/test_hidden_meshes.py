@@ -1,4 +1,4 @@
-"""Meshes of a character are hidden: neither drawn nor checked, which is said, and remembered."""
+"""Hidden meshes of a character: neither drawn nor checked, reported and remembered."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ARM, LEFT = "LeftArm", Qt.MouseButton.LeftButton
 
 @pytest.fixture
 def body(qtbot: QtBot, window: MainWindow) -> RigBody:
-    """Open a body whose left forearm goes through its right one at rest."""
+    """Open a body whose forearms cross at rest."""
     held = rigged_body()
     assert held.rig is not None
     moved = np.where(held.rest_vertices[:, :1] > 0.5, [-1.2, 0.0, -0.01], 0.0)
@@ -53,7 +53,7 @@ def entry(window: MainWindow, name: str) -> object:
 
 
 def coverage(picture: QIcon) -> float:
-    """Return how many pixels of a thumbnail the body covers."""
+    """Return the number of thumbnail pixels that the body covers."""
     image = picture.pixmap(THUMBNAIL, THUMBNAIL).toImage()
     image = image.convertToFormat(QImage.Format.Format_RGBA8888)
     return float((np.frombuffer(image.constBits(), dtype=np.uint8)[3::4] / 255.0).sum())
@@ -83,7 +83,7 @@ def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
     assert document.model.rules.left_out == (ARM,)
     assert not document.motion.exact.colliding
     assert f"Without {ARM}" in window.collision.exact.details.text()
-    # What is hidden is not under the pointer, nor tinted.
+    # A hidden mesh is not under the pointer, nor tinted.
     assert viewport.mouse is not None
     viewport.set_camera("Front", animated=False)
     rest(qtbot, window)
@@ -96,7 +96,7 @@ def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
     take_picture(window, "hidden-mesh")
     pose = window.library._poses[0]
     without = coverage(window.library._picture(pose))
-    # As the character is opened again.
+    # As when the character is opened again.
     document.set_model(document.model)
     settled(qtbot, window)
     assert window.meshes.hidden == (ARM,)
@@ -130,7 +130,7 @@ def test_a_part_too_small_to_be_dragged_has_a_handle_that_moves_it(
         scene.view = replace(near, position=position)
         mouse.mark(scene, shown(window))
         handles[times] = [handle.domain for handle in mouse._handles if handle.is_shown]
-    # Neither of what is large on the screen, nor of a body that is small.
+    # Neither for large parts on the screen, nor for a small body.
     assert (handles[0.5], handles[12.0]) == ([], [])
     assert hips in handles[1.2]
     scene.view = replace(near, position=near.focus + 1.2 * (near.position - near.focus))

@@ -1,4 +1,4 @@
-"""A new model from the window: page by page, in the background, across windows, to Open."""
+"""A new model in the window: wizard pages, background run, several windows, Open."""
 
 from __future__ import annotations
 
@@ -247,7 +247,7 @@ def test_what_cannot_be_learned_from_stays_on_the_first_page(
     QTest.keyClick(wizard.files.list, Qt.Key.Key_Delete)
     assert wizard.files.paths == ()
     assert wizard.refusal.text() == "Add a file or a folder first."
-    # More that is dropped goes to the dialog that is open.
+    # Further dropped files go to the open dialog.
     drop(wizard, tubes)
     qtbot.waitUntil(lambda: wizard.files.paths == (tubes,), timeout=PATIENCE)
     wizard.files.paths_changed.emit()
@@ -320,7 +320,7 @@ def test_a_run_that_nearly_always_collides_offers_the_character_instead(
     assert dialog.open_model.isVisible()
     QTest.mouseClick(dialog.open_model, LEFT)
     qtbot.waitUntil(lambda: isinstance(window.document.model, RigBody), timeout=PATIENCE)
-    # What was learned so far stays, until it is discarded.
+    # The finished part is kept until it is discarded.
     assert work.path.exists()
     work.tell(replace(status, sentence="the disk is full"))
     window.learning.runs.look()
@@ -461,7 +461,7 @@ def test_the_dialog_keeps_its_size_and_does_not_come_back_once_closed(
     runs.look()
     assert watching.learning.indicator.text() == "hero is ready"
     assert not [d for d in watching.findChildren(LearningDialog) if d.isVisible()]
-    # Nor in the next window; who asks for it has it back.
+    # Nor in the next window; clicking the indicator shows it again.
     watching.learning._told.clear()
     runs.changed.emit()
     assert not [d for d in watching.findChildren(LearningDialog) if d.isVisible()]

@@ -1,4 +1,4 @@
-"""The main story in a real window: drag, see, resolve, undo, export."""
+"""The main workflow in a real window: drag, look, resolve, undo, export."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_drag_with_a_key_held_is_ten_times_finer(
     for step in range(1, way + 1):
         move_held(slider, start + QPoint(step, 0), key)
     assert slider.place - before == pytest.approx(0.1 * way * per_pixel, abs=1.0)
-    # Let go of the key, the handle goes on from where it is.
+    # When the key is released, the handle continues from its position.
     fine = slider.place
     move_held(slider, start + QPoint(way + 1, 0), no_key)
     assert slider.place - fine == pytest.approx(per_pixel, abs=1.0)
@@ -172,7 +172,7 @@ def test_hovering_a_row_lights_its_domain_and_the_mesh_lights_its_row(
     assert canvas is not None
     assert scene is not None
     rest(qtbot, window)
-    # At whole pixels, as the pointer moves: a vertex on the outline may lie just beside its own.
+    # Use whole pixels, like the pointer: a vertex on the outline may be just beside its pixel.
     points = [
         on_screen(canvas, scene.surface.vertices[vertex]).toPoint()
         for vertex in np.flatnonzero(leading == 1)
@@ -244,7 +244,7 @@ def test_nothing_on_the_screen_speaks_of_the_mathematics(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document = window.document
-    # Further than the sliders go: Resolve remarks on that.
+    # Beyond the sliders' range, which Resolve notes.
     document.motion.blend_towards(1.5 * colliding, 1.0)
     rest(qtbot, window)
     for shading in Shading:
@@ -450,7 +450,7 @@ def test_changes_are_saved_kept_or_given_up_as_the_user_says(
     asked = answer(save)
     assert window.close()
     assert not asked.isActive()
-    # Save writes the file, not the pose of the library that this one began as.
+    # Save writes the file, not the library pose that this one came from.
     name = document.history.pose.name
     assert questions[1:] == [
         f"Save the pose “{name} changed” of “{document.model.name}” to “mine.json”?"
@@ -561,7 +561,7 @@ def test_a_wait_for_compiling_is_explained_while_it_lasts(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     log, go_on = logging.getLogger("lcollision_core.compiled"), threading.Event()
-    # The window that others share listens too.
+    # The shared window listens too.
     listening = list(log.handlers)
     caplog.set_level(logging.INFO, log.name)
     warm_up = preparing.warm_up
@@ -631,7 +631,7 @@ def test_a_failure_says_what_happened_and_below_it_what_to_do(window: MainWindow
     assert first.what.text() == "a; b.obj was truncated, expected 9, got 4"
     assert first.advice.text() == "Copy it again."
     assert second.what.text() == "Nothing to do"
-    # Nobody knows whether something was changed.
+    # Whether anything was changed is unknown.
     assert not second.advice.isVisible()
     assert not first.isModal()
     assert not second.isModal()
@@ -667,7 +667,7 @@ def test_save_as_saves_the_pose_that_was_open_when_it_was_asked_for(
     asked, later = document.history.pose, training_pose(document.model, 3)
 
     def answered(*_: object) -> Path:
-        # As a file that is read meanwhile.
+        # As a file being read meanwhile would.
         document.motion.load_pose(later)
         return file
 
@@ -677,7 +677,7 @@ def test_save_as_saves_the_pose_that_was_open_when_it_was_asked_for(
     assert told.args == [f"Saved “{asked.name}” to asked.json; the pose opened since is unsaved"]
     (saved,) = read_poses(file, document.model)
     assert saved.latent.tobytes() == asked.latent.tobytes()
-    # The pose that has come in stays as it is: it has not been saved.
+    # The loaded pose stays unchanged: it has not been saved.
     assert document.history.file is None
     assert document.history.pose.name == later.name
     monkeypatch.setattr(window.files, "ask_save", lambda *_: file)

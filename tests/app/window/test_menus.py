@@ -1,4 +1,4 @@
-"""What the menus list and how they look, and the small dialogs that they open."""
+"""Contents and look of the menus, and the small dialogs that they open."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ pytestmark = pytest.mark.one_window
 
 WIDEST_TITLE = "Recover a pose — LCollision"
 TITLE_BUTTONS = 160
-"""Pixels beside a title that a window manager takes for itself."""
+"""Width in pixels of the window manager's buttons beside a title."""
 
 
 def listed(menu: QMenu) -> dict[str, QAction]:
-    """Return what a menu lists when it is opened, by text."""
+    """Return the actions of an opened menu, by text."""
     menu.aboutToShow.emit()
     return {action.text(): action for action in menu.actions()}
 
@@ -40,7 +40,7 @@ def ticked(menu: QMenu) -> list[str]:
 def own_model(
     editor_model: LearnedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> LearnedBody:
-    """Return a model that lies in the user's folder as "dancer & co"."""
+    """Return a model stored in the user's folder as "dancer & co"."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     file = user_models_folder() / "dancer & co.safetensors"
     file.parent.mkdir(parents=True)
@@ -154,7 +154,7 @@ def test_the_focus_is_seen_on_what_is_chosen(qtbot: QtBot, window: MainWindow) -
     poses.setFocus()
     poses.setCurrentRow(1)
     before = poses.viewport().grab().toImage()
-    # Goes on without choosing.
+    # Move on without choosing.
     QTest.keyClick(poses, Qt.Key.Key_Right, Qt.KeyboardModifier.ControlModifier)
     assert poses.currentRow() == 2
     assert [index.row() for index in poses.selectedIndexes()] == [1]

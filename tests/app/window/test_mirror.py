@@ -31,7 +31,7 @@ from tests.rigged_shapes import rigged_tube
 pytestmark = pytest.mark.one_window
 
 FREE_THAT_COLLIDES_MIRRORED = 1
-"""As in the core's tests: the second sample of generator 0."""
+"""The second sample of generator 0, as in the core's tests."""
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def window(body_window: MainWindow) -> MainWindow:
 
 
 def press_mirror(qtbot: QtBot, window: MainWindow) -> str:
-    """Press Ctrl+M, wait for the pose, and return what the status bar says."""
+    """Press Ctrl+M, wait for the pose, and return the status bar's message."""
     told: list[str] = []
     window.document.message.connect(told.append)
     QTest.keyClick(window, Qt.Key.Key_M, Qt.KeyboardModifier.ControlModifier)
@@ -82,7 +82,7 @@ def test_mirroring_twice_is_the_pose_again_also_after_save_and_reopen(
     press_mirror(qtbot, window)
     assert document.history.latent.tobytes() == pose.tobytes()
 
-    # A changed image is another pose, whose mirror image is found anew.
+    # A changed image is another pose, whose mirror image is computed anew.
     document.history.undo()
     document.motion.set_code(3, document.history.latent[3] + 0.5)
     assert press_mirror(qtbot, window).startswith("Mirrored with a fit error")
@@ -130,7 +130,7 @@ def choose(window: MainWindow, *names: str) -> QPoint:
 
 
 def mirror_by_menu(qtbot: QtBot, window: MainWindow, place: QPoint, picture: str = "") -> str:
-    """Open the context menu of chosen poses, choose Mirror, and return what is said of it."""
+    """Open the context menu of the selected poses, choose Mirror, and return the message."""
     told: list[str] = []
     window.document.message.connect(told.append)
     window.library.list.customContextMenuRequested.emit(place)

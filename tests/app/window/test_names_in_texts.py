@@ -1,4 +1,4 @@
-"""Names of poses, body parts and models are shown to the letter, whatever is in them."""
+"""Names of poses, body parts and models are shown literally, whatever they contain."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ HOSTILE = ("arms &hands & more", "<b>bold</b><img src=x>")
 
 @pytest.fixture
 def hostile(qtbot: QtBot, editor_model: LearnedBody, tmp_path: Path) -> Iterator[MainWindow]:
-    """Return a window whose body parts, pose and steps of undo have hostile names."""
+    """Return a window whose body parts, pose and undo steps have hostile names."""
     document = PoseDocument(editor_model.edit_domains(dict(enumerate(HOSTILE))))
     window = open_window(qtbot, document, settings_in(tmp_path))
     for name in HOSTILE:
@@ -51,7 +51,7 @@ def menu_actions(menu: QMenu) -> Iterator[QAction]:
 
 
 def shown_text(text: str) -> str:
-    """Return what a menu shows of a text, without the lines under its letters."""
+    """Return a menu text as shown, without mnemonics."""
     return text.replace("&&", "\0").replace("&", "").replace("\0", "&")
 
 
@@ -81,7 +81,7 @@ def test_no_text_of_a_window_takes_a_name_for_a_shortcut_or_for_html(hostile: Ma
             assert widget.textFormat() is Qt.TextFormat.PlainText
     for menu in hostile.menus.values():
         for action in menu_actions(menu):
-            # A menu shows HTML to the letter, and "&" only where it is doubled.
+            # A menu shows HTML literally, and "&" only if it is doubled.
             if "hands" in action.text() and action.objectName() != "pin_hands":
                 assert HOSTILE[0] in shown_text(action.text())
 
@@ -103,7 +103,7 @@ def test_dialogs_show_a_name_to_the_letter(hostile: MainWindow) -> None:
         act()
         assert not asked.isActive()
     assert {form for _, form in looked} == {Qt.TextFormat.PlainText}
-    # Only the label of a field makes shortcuts of "&".
+    # Only a field's label turns "&" into a shortcut.
     assert name in looked[0][0]
     assert name.replace("&", "&&") in looked[1][0]
     dialog = FailureDialog(Failure(f"{name} cannot be read", name), hostile)
@@ -123,7 +123,7 @@ def test_the_list_of_shortcuts_names_no_step(window: MainWindow) -> None:
     words = [label.text() for label in dialog.findChildren(QLabel)]
     assert {"Undo", "Redo"} <= set(words)
     assert [word for word in words if word.startswith(("Undo ", "Redo "))] == []
-    # What the mouse does comes first, and submenus are nested.
+    # Mouse actions come first, and submenus are nested.
     assert words.index("Drag the body") < words.index("Menu File") < words.index("Menu Pose")
     assert "Edit > Contacts > Propose" in words
     indents = {label.text(): label.indent() for label in dialog.findChildren(QLabel)}
@@ -166,6 +166,6 @@ def test_a_swatch_has_the_colour_of_the_body_in_both_themes(window: MainWindow) 
         for group, colour in zip(window.sliders.groups[1:], model.card.domain_colours, strict=True):
             picture = group.header.grab().toImage()
             assert picture.pixelColor(32, group.header.height() // 2) == QColor(colour)
-        # It is edged where it is hardly seen.
+        # A colour that is hardly visible gets an edge.
         edge = row.grab().toImage().pixelColor(4, row.height() // 2)
         assert (edge == QColor(dark_blue)) == (theme == "light")

@@ -1,4 +1,4 @@
-"""What is typed into a field is taken as it is and marked, or refused in a sentence."""
+"""Typed numbers are accepted and marked, or refused in a sentence."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_a_number_that_is_too_far_is_refused_in_a_sentence(window: MainWindow, t
     assert f"{text} is out of range: type a number from" in told
     assert told.startswith(row.slider.accessibleName())
     assert QToolTip.text() in told
-    # By leaving the field too.
+    # Also by leaving the field.
     window.statusBar().clearMessage()
     row.field.setFocus()
     row.field.selectAll()

@@ -1,4 +1,4 @@
-"""When a window is painted while a pose changes."""
+"""Painting of a window while a pose changes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.app.windows import PATIENCE, rest
 
 
 class LayoutCounter(QObject):
-    """Counts how often the watched widgets are asked to lay out what is in them."""
+    """Counts the layout requests of watched widgets."""
 
     n_asked = 0
 
@@ -41,7 +41,7 @@ def test_the_window_is_painted_only_once_all_follows_the_pose(
     document.motion.blend_towards(0.5 * colliding, 1.0)
     rest(qtbot, window)
     done: list[str] = []
-    # Connected last, it is called when all panels have followed.
+    # Connected last, so it is called after all panels.
     document.motion.frame_changed.connect(lambda: done.append("followed"))
     canvas.frameSwapped.connect(lambda: done.append("painted"))
     for latent in (colliding, free):
@@ -58,7 +58,7 @@ def test_the_window_is_painted_only_once_all_follows_the_pose(
 def test_a_row_is_laid_out_only_where_its_number_may_need_more_width(window: MainWindow) -> None:
     row = window.sliders.row_of(0)
     typed = row.field.minimum(), row.field.maximum()
-    # What opening the window has asked for is no concern of the numbers.
+    # Exclude the layout requests of opening the window.
     QApplication.sendPostedEvents(None, QEvent.Type.LayoutRequest)
     counter = LayoutCounter()
     row.installEventFilter(counter)

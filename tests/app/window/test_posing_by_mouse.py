@@ -1,4 +1,4 @@
-"""Poses that people make first, made in a real window by the mouse alone, in a few drags."""
+"""Typical first poses, made in a real window by a few mouse drags."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ from tests.app.windows import (
 LEFT, NO_KEY = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
 MOST_DRAGS, NEAR = 4, 0.03
 A_CLICK = 4
-"""Pixels: the pointer moves so far at least in a drag."""
+"""Least movement of the pointer in a drag, in pixels."""
 
 Point = tuple[float, float, float]
 
 
 class Recipe(NamedTuple):
-    """How a pose is made: with feet, hands and the aim pinned, the right hand's pin is dragged.
+    """Recipe for a pose: pin feet, hands and the aim, then drag the right hand's pin.
 
     Attributes
     ----------
-    aim : place of the surface where the hand is to end, in the data's unit, at the start
-    cameras : from which the hand is dragged to it, one a drag
+    aim : target point of the hand on the surface at the start, in the data's unit
+    cameras : the camera of each drag
     """
 
     name: str
@@ -65,7 +65,7 @@ RECIPES = (
 
 
 ACROSS = 0.1
-"""Normalised: how far past the middle of the body each hand of crossed arms ends at least."""
+"""Least distance of each hand of crossed arms past the middle of the body, normalised."""
 
 CROSSED: tuple[tuple[bool, Point], ...] = (
     (True, (0.13, -0.22, 1.18)),
@@ -73,14 +73,14 @@ CROSSED: tuple[tuple[bool, Point], ...] = (
     (True, (0.26, -0.20, 1.18)),
     (False, (-0.26, -0.20, 1.14)),
 )
-"""Drags from the front that cross the arms: whether of the right hand, and where to."""
+"""Drags from the front that cross the arms: whether the right hand, and its target."""
 
 
 PAST_MIDDLE = 0.04
-"""Normalised: the same of the middles of the hands of a character."""
+"""The same for the middles of a character's hands, normalised."""
 
 RIGHT_ANGLE = 0.35
-"""Cosine of 70 degrees: between thigh and shin of who sits there are 70 to 110."""
+"""Cosine of 70 degrees: the angle between thigh and shin of a sitting body is 70 to 110."""
 
 CHARACTERS = pytest.mark.parametrize(
     "character_window",
@@ -91,7 +91,7 @@ CHARACTERS = pytest.mark.parametrize(
 
 
 class Hand:
-    """Uses the mouse in a window as a person does: clicks menus, double-clicks, drags slowly."""
+    """Uses the mouse in a window like a person: clicks menus, double-clicks, drags slowly."""
 
     def __init__(self, qtbot: QtBot, window: MainWindow) -> None:
         assert window.viewport.canvas is not None
@@ -100,7 +100,7 @@ class Hand:
         self.n_drags = 0
 
     def choose(self, text: str) -> None:
-        """Click an entry of the menu that is open, once it is there."""
+        """Click an entry of the open menu, once it is shown."""
 
         def entries() -> list[QAction]:
             menu = QApplication.activePopupWidget()
@@ -123,13 +123,13 @@ class Hand:
     def look_from(self, camera: str) -> None:
         """Choose a camera in the menu of the tool bar."""
         button = self._window.findChild(QToolButton, "cameras")
-        # The button goes on when its menu has been closed.
+        # The button's handler continues when its menu is closed.
         QTimer.singleShot(0, self._window, lambda: self.choose(camera))
         QTest.mouseClick(button, LEFT)
         rest(self._qtbot, self._window)
 
     def pin(self, vertex: int) -> None:
-        """Double-click a place of the surface."""
+        """Double-click a vertex of the surface."""
         n_pins = len(self._document.history.pose.pins)
         double_click(self._canvas, place_of(self._window.viewport, vertex))
         assert len(self._document.history.pose.pins) == n_pins + 1
@@ -156,7 +156,7 @@ class Hand:
         self._pause(100)
 
     def _pause(self, n_frames: int) -> None:
-        """Wait until the body comes no further, but not for ever: people go on."""
+        """Wait until the body comes no nearer, but not for ever, like a person."""
         shown: list[None] = []
         count = self._document.motion.frame_changed.connect(lambda: shown.append(None))
         self._qtbot.wait(16)
@@ -190,7 +190,7 @@ def test_a_pose_is_made_by_mouse_alone(
     grip = document.motion.grip_at(taken)
 
     def miss() -> float:
-        """Return how far the hand's patch is from the aim on the body, normalised."""
+        """Return the normalised distance of the hand's patch from the aim on the body."""
         vertices = shown(body_window)
         return float(np.linalg.norm(grip.position(vertices) - vertices[aim]) / model.body_size)
 
@@ -237,16 +237,16 @@ def test_arms_are_crossed_by_mouse_alone(qtbot: QtBot, body_window: MainWindow) 
 
 
 class Puppeteer(Hand):
-    """Drags a character by the middles of its body parts, seen from the front or the side."""
+    """Drags a character by the middles of its body parts, from the front or the side."""
 
     def part(self, name: str) -> npt.NDArray[np.float64]:
-        """Return the (3,) middle of a body part as it is shown."""
+        """Return the (3,) middle of a body part as shown."""
         return shown(self._window)[self.inside(name)].astype(np.float64).mean(axis=0)
 
     def drag(
         self, name: str, to: npt.NDArray[np.floating], key: Qt.KeyboardModifier = NO_KEY
     ) -> None:
-        """Drag what is seen of a body part to where a (3,) point is seen, unless it is there."""
+        """Drag a body part to the position of a (3,) point on the screen, unless it is there."""
         canvas, (end,) = self._canvas, self._places(to[None])
         start = self._seen(name)
         if np.abs(end - start).max() < A_CLICK:
@@ -264,7 +264,7 @@ class Puppeteer(Hand):
         self._pause(100)
 
     def inside(self, name: str) -> npt.NDArray[np.bool_]:
-        """Return which vertices a body part leads: (V,)."""
+        """Return the (V,) mask of a body part's vertices."""
         model = self._document.model
         (domain,) = (k for k, n in enumerate(model.domain_names) if n.casefold() == name)
         inside: npt.NDArray[np.bool_] = model.space.vertex_domain == domain
@@ -277,7 +277,7 @@ class Puppeteer(Hand):
         return places_of(scene.view, points.astype(np.float64), size)
 
     def _seen(self, name: str) -> npt.NDArray[np.float64]:
-        """Return the (2,) place nearest to the middle of a body part where nothing hides it."""
+        """Return the (2,) visible position nearest to the middle of a body part."""
         scene, inside = self._window.viewport.scene, self.inside(name)
         assert scene is not None
         (middle,) = self._places(self.part(name)[None])
@@ -301,18 +301,18 @@ class Studio:
         self.hand = Puppeteer(qtbot, window)
 
     def begin(self) -> None:
-        """Go back to the rest pose."""
+        """Return to the rest pose."""
         self._document.motion.reset_all()
         rest(self._qtbot, self._window)
         self.hand.n_drags = 0
 
     def drag(self, camera: str, part: str, to: npt.NDArray[np.floating]) -> None:
-        """Drag a body part, seen from a side."""
+        """Drag a body part from a camera."""
         self.hand.look_from(camera)
         self.hand.drag(part, self.size * to)
 
     def done(self, pose: str) -> npt.NDArray[np.float64]:
-        """Take pictures of a pose, and return its vertices, which are free of collisions."""
+        """Take pictures of a pose, check that it is free, and return its vertices."""
         rest(self._qtbot, self._window)
         name = self._document.model.name
         for shading in (Shading.TEXTURED, Shading.DOMAINS):
@@ -326,7 +326,7 @@ class Studio:
         return shown(self._window).astype(np.float64) / self.size
 
     def way(self, part: str, since: npt.NDArray[np.floating]) -> list[float]:
-        """Return how far left, in front and above a point a body part is."""
+        """Return how far to the left, in front of and above a point a body part is."""
         arm = self.hand.part(part) / self.size - since
         return [float(arm @ axis) for axis in (self.left, self.front, self.up)]
 
@@ -359,7 +359,7 @@ def test_a_hand_is_laid_on_the_other_hip_by_mouse(
     studio = Studio(qtbot, character_window)
     hip = studio.hips + 0.08 * studio.left
     studio.begin()
-    # The hand comes forward, goes across, and is laid on the hip from the side.
+    # The hand moves forward, then across, and is laid on the hip from the side.
     studio.drag("Right", "right hand", studio.hips + 0.25 * studio.front + 0.1 * studio.up)
     studio.drag("Front", "right hand", hip)
     studio.drag("Front", "right hand", hip)
@@ -373,7 +373,7 @@ def test_a_hand_is_laid_on_the_other_hip_by_mouse(
 def test_a_character_is_posed_by_mouse_in_four_drags_each(
     qtbot: QtBot, character_window: MainWindow
 ) -> None:
-    """Each hand comes to rest on the body, not behind it, and what is not held stays."""
+    """Each hand comes to rest on the body, not behind it, and parts that are not held stay."""
     studio = Studio(qtbot, character_window)
     begin, drag, done, way, hand = studio.begin, studio.drag, studio.done, studio.way, studio.hand
     window, size = character_window, studio.size
@@ -383,7 +383,7 @@ def test_a_character_is_posed_by_mouse_in_four_drags_each(
     begin()
     drag("Front", "right hand", chin)
     done("hand on chin")
-    # The face is 0.05 to 0.06 before the middle of the head.
+    # The face is 0.05 to 0.06 in front of the middle of the head.
     assert way("right hand", chin) == pytest.approx([0.0, 0.07, 0.0], abs=0.03)
 
     begin()
@@ -391,7 +391,7 @@ def test_a_character_is_posed_by_mouse_in_four_drags_each(
     for _ in range(2):
         drag("Front", "right hand", chest + 0.10 * left + 0.05 * up)
         drag("Front", "left hand", chest - 0.10 * left)
-        # Contacts with the other arm on the way do not hold it up: one drag suffices.
+        # Contacts with the other arm on the way do not stop it: one drag suffices.
         assert way("left hand", chest)[0] < -PAST_MIDDLE
     done("arms crossed")
     rights, lefts = way("right hand", chest), way("left hand", chest)

@@ -1,4 +1,4 @@
-"""From 800 x 600 up everything can be reached, panels float beside, and tracks grow."""
+"""From 800 x 600 up, everything can be reached, panels float beside, and tracks grow."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ SMALL = QSize(800, 600)
 @pytest.fixture
 def small(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> MainWindow:
     held = open_window(qtbot, document, settings_in(tmp_path), (SMALL.width(), SMALL.height()))
-    # Below a width the poses get the corner, which makes still narrower possible.
+    # Below a certain width the poses get the corner, which allows still narrower windows.
     held.resize(SMALL)
     settle_layout(qtbot, held)
     return held
@@ -67,7 +67,7 @@ def test_everything_is_reached_at_800_by_600(qtbot: QtBot, small: MainWindow) ->
             assert not button.isVisible() or lies_in(button, small) or _scrolls(button)
     for button in small.findChild(QToolBar).findChildren(QToolButton):
         assert not button.isVisible() or lies_in(button, small)
-    # What does not fit is in an area that scrolls there.
+    # Contents that do not fit are in a scroll area.
     card = small.collision.resolve
     area = small.collision.findChild(QScrollArea)
     area.ensureWidgetVisible(card.button)
@@ -198,7 +198,7 @@ def test_a_window_of_1280_by_720_is_mostly_view_and_cuts_no_readout(
     nearest.setText("Least distance above 13.58 mm")
     for button in (nearest, held.collision.resolve.button, held.collision.resolve.options):
         assert button.width() >= button.sizeHint().width(), button.text()
-    # One line below the sliders, which have the height that it had.
+    # One line below the sliders, which get the height that it had.
     row = held.randomise
     assert row.height() < 1.5 * held.collision.resolve.button.height()
     row.seed.setValue(999_999)
@@ -245,19 +245,19 @@ def test_where_there_is_no_room_beside_a_panel_hides_no_body() -> None:
         place = QRect(beside(panel, window, body, room), panel.size())
         assert room.contains(place)
         assert not place.intersects(body)
-    # The screen of the window need not begin at 0.
+    # The window's screen need not start at 0.
     second = QRect(2000, 0, 1000, 800)
     place = QRect(beside(panel, QRect(2000, 0, 600, 800), body, second), panel.size())
     assert place.left() > 2600
     assert second.contains(place)
-    # Larger than the screen, its title bar stays in reach.
+    # If it is larger than the screen, its title bar stays within reach.
     vast = QRect(0, 0, 1200, 900)
     corner = beside(vast, QRect(0, 0, 1000, 800), body, room)
     assert room.contains(corner)
 
 
 def drag_line(qtbot: QtBot, window: MainWindow, dock: QDockWidget, by: int) -> None:
-    """Drag the line at the right of a panel, as a user does."""
+    """Drag the splitter at the right of a panel, as a user does."""
     start = QPoint(dock.geometry().right() + 3, dock.geometry().center().y())
     QTest.mousePress(window, Qt.MouseButton.LeftButton, pos=start)
     for step in range(1, 6):
@@ -277,7 +277,7 @@ def test_the_width_of_a_panel_is_the_users_and_remembered(
     drag_line(qtbot, first, sliders, 90)
     wanted = sliders.width()
     assert wanted == pytest.approx(before + 90, abs=3)
-    # A narrow window takes of it only as long as it is narrow.
+    # A narrow window reduces it only while it is narrow.
     for width in (800, 1360, 1580):
         first.resize(width, 800)
         settle_layout(qtbot, first)
@@ -311,7 +311,7 @@ def test_resolve_is_in_sight_beside_long_lists_and_notes(
     with qtbot.waitSignal(document.tasks.solve_finished, timeout=PATIENCE):
         window.actions_by_key["resolve"].trigger()
     panel = window.collision
-    # As of a body with many parts, whose rules leave much out.
+    # As for a body with many parts, whose rules leave much out.
     for row in panel.prediction.rows:
         row.setFixedHeight(400)
     panel.proposal.show()

@@ -40,7 +40,7 @@ def test_a_motion_shapes_the_body_and_comes_back(
     document.motion.set_code(document.model.latent_size - 1, 0.2)
     document.motion.end_gesture()
     qtbot.waitUntil(lambda: bool(timeline.changes))
-    # What a crash would leave, and the body as it was opened at first.
+    # As after a crash: the autosaved edits, and the body as first opened.
     codes = timeline.motion.codes
     sessions = tmp_path / "sessions"
     assert Autosave(document, sessions, seconds=1000.0).close(keep=True)

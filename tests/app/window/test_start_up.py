@@ -1,4 +1,4 @@
-"""How the editor starts: with which model, and what it loads before there is a window."""
+"""Start of the editor: its model, and the modules loaded before the window is shown."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_body_is_opened_without_what_only_learning_and_statistics_need() -> No
 
 
 def loaded_with(imported: str, *modules: str) -> set[str]:
-    """Return which of some modules an import loads in a new process."""
+    """Return the given modules that an import loads in a new process."""
     code = f"import sys; import {imported}; print(*sys.modules)"
     told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     return set(modules) & set(told.stdout.split())
@@ -65,7 +65,7 @@ def test_a_file_without_a_skeleton_is_refused_for_what_it_is(
     assert failures[0].headline == said
     assert "yesterday" not in f"{failures[0].headline} {failures[0].next_step}"
     failures.clear()
-    # In a window, whose body the user has chosen, it is compared with that.
+    # In a window whose body the user has chosen, it is compared with that.
     window.files.open_path(stabbed)
     qtbot.waitUntil(lambda: bool(failures))
     assert "the model 'yesterday'" in failures[0].headline

@@ -1,4 +1,4 @@
-"""Characters as they look, in a real window: what they open with, switched, posed, pointed at."""
+"""Textured characters in a real window: initial shading, switching, posing, pointing."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def place(window: MainWindow, *point: float) -> QPoint:
 
 
 def colour_at(window: MainWindow, *point: float) -> tuple[int, ...]:
-    """Return what the screen shows where a point of the scene is."""
+    """Return the screen's colour at a point of the scene."""
     seen, shown = place(window, *point), pixels(window.viewport)
     return tuple(int(value) for value in shown[seen.y(), seen.x()])
 
 
 def look_at_the_front(qtbot: QtBot, window: MainWindow) -> None:
-    """Look at a character with the pointer beside it: a patch that is pointed at is outlined."""
+    """Look at a character with the pointer beside it: a patch under it would be outlined."""
     canvas = window.viewport.canvas
     assert canvas is not None
     for corner in (QPoint(6, 6), QPoint(3, 3)):
@@ -60,7 +60,7 @@ def test_a_character_opens_as_it_looks_and_others_as_before(
     assert window.viewport.shading is Shading.TEXTURED
     assert window.actions_by_key["textured"].isChecked()
     look_at_the_front(qtbot, window)
-    # It faces the viewer by its front, whose texture is red on its left half as it is seen.
+    # Its front faces the viewer; the texture's left half, as seen, is red.
     front = model.front * 1.0
     right = np.cross(np.eye(3)[model.up_axis], front)
     assert colour_at(window, *(front - 0.5 * right)) == RED
@@ -69,7 +69,7 @@ def test_a_character_opens_as_it_looks_and_others_as_before(
     with qtbot.waitSignal(window.document.tasks.opened, timeout=PATIENCE):
         drop(window, arm().write(tmp_path / "arm.glb"))
     rest(qtbot, window)
-    # Its material is white: nothing to see, and yet it may be chosen.
+    # Its plain white material is not the default shading, but can be chosen.
     assert window.viewport.shading is Shading.DOMAINS
     assert window.settings["shading"] == "domains"
 
@@ -104,7 +104,7 @@ def test_a_posed_character_takes_its_texture_along(
     right = np.cross(np.eye(3)[model.up_axis], model.front)
     moves = [model.decode(row).mean(axis=0) @ right for row in np.eye(model.latent_size)[:3]]
     code = int(np.abs(moves).argmax())
-    # By half a side.
+    # Move it by half a side.
     document.motion.set_code(code, float(1.0 / moves[code]))
     rest(qtbot, window)
     assert colour_at(window, *(model.front + 0.5 * right)) == RED
@@ -121,7 +121,7 @@ def test_the_patch_under_the_pointer_is_seen_on_a_texture(
     point = model.front + 0.97 * (right + np.eye(3)[model.up_axis])
     assert colour_at(window, *point) == BLUE
     canvas = window.viewport.canvas
-    # A pointer that is there already, from a test before, does not move.
+    # A pointer that is already there, from an earlier test, does not move.
     QTest.mouseMove(canvas, QPoint(3, 3))
     qtbot.wait(100)
     QTest.mouseMove(canvas, place(window, *point))

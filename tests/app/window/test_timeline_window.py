@@ -1,4 +1,4 @@
-"""The timeline in a real window: opened, gone through by keys and by mouse, exported, filmed."""
+"""The timeline in a real window: opening, keyboard, mouse, export and video."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_the_timeline_comes_with_a_motion_and_goes_without(
         drop(window, swing)
     qtbot.waitUntil(window.timeline.isVisible)
     assert [window.timeline.clips.itemText(k) for k in range(2)] == [CLIP, OTHER]
-    # Frames are no poses of the library.
+    # Frames are not poses of the library.
     names = [window.library.list.item(k).text() for k in range(window.library.list.count())]
     assert not any(name.startswith(CLIP) for name in names)
 
@@ -127,7 +127,7 @@ def test_a_click_on_the_strip_goes_there_and_what_it_says_is_what_was_found(
     assert swinging.timeline.facts.text().endswith(" % deep; ◆ 1 collision between frames")
     timeline.checks = MotionChecks.of(N_FRAMES, len(swinging.document.model.domain_names))
     timeline.checked.emit()
-    # Nothing is known yet.
+    # No frame is checked yet.
     assert swinging.timeline.facts.text() == f"0 of {N_FRAMES} frames checked"
 
 
@@ -155,9 +155,9 @@ def test_what_is_not_counted_has_a_line_of_its_own_and_is_said_in_full_on_hoveri
 
 
 def painted(window: MainWindow, frame: int) -> tuple[bool, int]:
-    """Return whether the pixels of a frame's exact check are those of an overlap, and the height.
+    """Return whether a frame's exact check is painted as a collision, and the bar's height.
 
-    The bar begins at the bottom; what is above it has the strip's own colour.
+    The bar starts at the bottom; above it, the strip has its own colour.
     """
     strip = window.timeline.strip
     track = strip._track()
@@ -173,9 +173,9 @@ def painted(window: MainWindow, frame: int) -> tuple[bool, int]:
 
 
 def deepest_overlap(window: MainWindow, frame: int) -> float:
-    """Return the deepest overlap of a frame, of all pairs of faces: no tree, no code of the strip.
+    """Return a frame's deepest penetration by all pairs of faces, independently of the strip.
 
-    Whether two faces meet is up to code that shares nothing with ours.
+    Independent code decides whether two faces intersect.
     """
     document = window.document
     model, motion = document.model, document.timeline.motion
@@ -198,9 +198,9 @@ def test_the_strip_shows_of_ten_frames_what_brute_force_finds(
     frames = np.linspace(0, N_FRAMES - 1, 10).round().astype(int).tolist()
 
     def compare(before: MotionChecks | None = None) -> list[bool]:
-        """Compare what is painted of the frames, off the playhead, and return which collide.
+        """Check the painted frames, off the playhead, and return which collide.
 
-        Of the motion whose checks come after others.
+        With `before`, wait for checks other than those.
         """
         qtbot.waitUntil(lambda: timeline.checks is not before and is_checked(swinging, N_FRAMES))
         timeline.go_to(frames[4] + 2)
@@ -215,7 +215,7 @@ def test_the_strip_shows_of_ten_frames_what_brute_force_finds(
             assert is_free_by_brute_force(document.model, vertices) != is_warm
             said = strip._facts(frame)[1]
             assert said == "free" if deep == 0.0 else said.startswith("overlaps by")
-        # The deeper, the higher, and what is free is lower than any overlap.
+        # Deeper is higher, and free frames are lower than any collision.
         heights = np.array([height for _, height in seen])[np.argsort(deepest, kind="stable")]
         assert (np.diff(heights) >= 0).all()
         return [is_warm for is_warm, _ in seen]
@@ -226,7 +226,7 @@ def test_the_strip_shows_of_ten_frames_what_brute_force_finds(
     timeline.resolve()
     qtbot.waitUntil(lambda: not document.tasks.solving_motion)
     assert not any(compare(before))
-    # Back into the trunk by hand, within what was resolved.
+    # Move back into the trunk by hand, within a resolved span.
     document.motion.set_solid(False)
     assert timeline.original is not None
     timeline.go_to(frames[5])
@@ -290,7 +290,7 @@ def test_a_skeletons_motion_is_resolved_and_comes_back_as_such(
 def export_by(
     qtbot: QtBot, window: MainWindow, choose: Callable[[QDialog], None], timers: list[QTimer]
 ) -> list[str]:
-    """Export the motion as chosen in its form, and return what the status bar said."""
+    """Export the motion with the form's settings, and return the status bar's message."""
     timers.append(answer(choose))
     told: list[str] = []
     window.document.message.connect(told.append)
@@ -465,7 +465,7 @@ def test_the_camera_follows_a_body_that_walks_until_it_is_told_not_to(
         np.delete(far.position - near.position, document.model.up_axis), expected, atol=1e-5
     )
     np.testing.assert_allclose(far.position - far.focus, near.position - near.focus, atol=1e-9)
-    # An edit of the frame moves no camera.
+    # Editing the frame does not move the camera.
     document.motion.set_code(0, float(document.history.latent[0]) + 0.5)
     rest(qtbot, window)
     assert np.array_equal(viewport.scene.view.position, far.position)
@@ -668,7 +668,7 @@ def test_save_exports_an_edited_motion_and_save_as_saves_the_frame_as_a_pose(
         np.testing.assert_allclose(
             again.vertices(frame, check), motion.vertices(frame, check), atol=1e-5
         )
-    # All of the motion is in a file: what is left to save is the frame as a pose.
+    # The motion is in a file: only the frame as a pose is left to save.
     timers.append(answer(give_up))
     swinging.actions_by_key["save"].trigger()
     assert asked == ["Export motion", "Save poses", "Save poses"]
@@ -730,7 +730,7 @@ def test_a_pose_is_asked_about_before_the_timeline_takes_its_place(
     assert all("mine.json" in words for words in told)
     (held,) = read_poses(tmp_path / "mine.json", document.model)
     assert held.latent.tobytes() == mine.tobytes()
-    # Nor does Save put the frame in its place there.
+    # Nor does Save replace it by the frame.
     asked: list[str] = []
 
     def give_up(dialog: QDialog) -> None:

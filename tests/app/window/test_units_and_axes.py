@@ -20,7 +20,7 @@ pytestmark = pytest.mark.one_window
 
 
 def answer_with(words: str, told: list[str], picture: str = "scale_and_import") -> None:
-    """Click a button of the question that is about to be asked."""
+    """Click a button of the next question."""
 
     def click() -> None:
         box = QApplication.activeModalWidget()
@@ -79,7 +79,7 @@ def test_a_model_is_turned_upright_in_its_file_where_the_user_agrees(
         return
     with qtbot.waitSignal(document.model_changed, timeout=20_000):
         upright.trigger()
-        # It is done in the other thread.
+        # It runs in the other thread.
         assert document.tasks.incoming == "Turning own"
     assert "This changes the model's file" in told[1]
     assert document.model.up_axis == 2

@@ -1,4 +1,4 @@
-"""What the window says, in plain, standard words."""
+"""The window's texts, in plain, standard words."""
 
 from __future__ import annotations
 

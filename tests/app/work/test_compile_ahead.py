@@ -1,4 +1,4 @@
-"""What a first start needs is compiled in a process of its own."""
+"""The loops of a first start are compiled in a separate process."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.app.windows import PATIENCE
 
 @pytest.fixture
 def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the empty folder where Numba keeps what it compiles."""
+    """Return the empty folder of Numba's cache."""
     folder = tmp_path / "kept"
     folder.mkdir()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder))
@@ -31,7 +31,7 @@ def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_first_start_compiles_beside_the_window_and_a_second_does_not(
     kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A folder of the user's, with a package of the same name.
+    # A user's folder with a package of the same name.
     (tmp_path / "app").mkdir()
     (tmp_path / "app" / "__init__.py").write_text("raise SystemExit")
     monkeypatch.setattr(sys, "path", [str(Path(__file__).parents[3]), *filter(None, sys.path)])

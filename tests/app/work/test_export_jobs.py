@@ -1,4 +1,4 @@
-"""The window's exports: into the user's own file, and motions, each checked as it is written."""
+"""The window's exports: into the user's own file, and motions, each checked when written."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_a_pose_goes_into_the_character_s_own_file(
     assert n_pairs > 1
     verdict = f"{n_pairs} pairs of its triangles collide"
     assert told.startswith(f"Exported posed.glb: {verdict}; ")
-    # Every verdict says what the rules leave out.
+    # Every verdict states what the rules leave out.
     assert "are not counted; its clip 'wave' is left out, as it" in told
     assert np.abs(vertices - character.decode(latent)).max() < 1e-5
 

@@ -1,4 +1,4 @@
-"""Runs in processes of their own: begun, followed, stopped, killed, continued, discarded."""
+"""Runs in separate processes: started, followed, stopped, killed, continued, discarded."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def wait_for(qtbot: QtBot, runs: LearningRuns, path: Path, is_so: object) -> Lea
 
 
 def process_of(path: Path) -> int:
-    """Return the number of the process that learns in a folder."""
+    """Return the id of the process that works on a folder."""
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             words = (entry / "cmdline").read_bytes().split(b"\0")
@@ -154,7 +154,7 @@ def test_what_stopped_as_nearly_all_samples_collide_goes_on_regardless_once_it_i
         path,
         lambda run: run.state == RunState.FAILED and not run.status.mostly_collides,
     )
-    # All of them do, so that even then there is nothing to tell apart.
+    # All samples collide, so even then there is nothing to learn.
     assert "training needs some of each" in again.status.sentence
 
 
@@ -167,7 +167,7 @@ def test_what_cannot_be_learned_from_is_said_in_one_sentence(
     failed = wait_for(qtbot, runs, path, lambda run: run.state == RunState.FAILED)
     assert "broken.npz" in failed.status.sentence
     assert "\n" not in failed.status.sentence
-    # The run says why before its process ends, which writes the log.
+    # The run states the reason before its process ends, which writes the log.
     qtbot.waitUntil(lambda: "Traceback" in failed.work.log.read_text(), timeout=PATIENCE)
 
 
@@ -179,7 +179,7 @@ def test_a_run_that_is_stopped_while_its_process_starts_ends_at_once(
     path = runs.start(LearningRequest((str(tube_file),), "quick"), "hero")
     qtbot.waitUntil(lambda: runs._is_starting(path))
     number = process_of(path)
-    # Another window doesn't know that there is a process.
+    # Another window does not know of the process.
     LearningRuns(runs).stop(path)
     assert not (path / STOP).exists()
     qtbot.waitUntil(lambda: not Path(f"/proc/{number}").exists(), timeout=PATIENCE)
@@ -190,7 +190,7 @@ def test_a_run_that_is_stopped_while_its_process_starts_ends_at_once(
 
 
 def stay_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the learner run in this process, whose priority and signals stay."""
+    """Let the learner run in this process without changing its priority and signals."""
     monkeypatch.setattr(learner, "_give_way", lambda: None)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
 
@@ -298,6 +298,6 @@ def test_the_learner_refuses_a_folder_without_a_request(tmp_path: Path) -> None:
     )
     assert result.returncode == 2, result.stderr
     assert work.status.state == RunState.FAILED
-    # It finished none of its stages.
+    # It finished no stage.
     assert not work.status.seconds
     assert "request.json" in work.status.sentence

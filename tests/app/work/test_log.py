@@ -1,4 +1,4 @@
-"""The log file: unhandled errors and what Qt says."""
+"""The log file: unhandled errors and Qt's messages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from app.work.threads import Failure
 
 @pytest.fixture
 def logging_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Log into a file of the test's own, and put everything back."""
+    """Log to a file of the test, and restore everything."""
     path = tmp_path / "logs" / "editor.log"
     monkeypatch.setattr(log, "log_file", lambda: path)
     root = logging.getLogger()
@@ -45,7 +45,7 @@ def test_the_log_holds_what_nobody_caught_and_what_qt_says(logging_into: Path) -
     thread = threading.Thread(target=lambda: 1 / 0, name="worker")
     thread.start()
     thread.join()
-    # As Qt's threads do with what their slots raise.
+    # Qt's threads do this with errors in slots.
     slot = threading.Thread(target=sys.excepthook, args=(OSError, OSError("lost disk"), None))
     slot.start()
     slot.join()

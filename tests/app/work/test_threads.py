@@ -1,4 +1,4 @@
-"""The threads: the newest request wins, nothing old is shown, and a failure breaks nothing."""
+"""The threads: the newest request wins, no old frame is shown, a failure breaks nothing."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ def test_the_mesh_follows_250_events_and_ends_right(qtbot: QtBot, document: Pose
     qtbot.waitUntil(lambda: bool(shown) and shown[-1] == 1.0, timeout=20_000)
     document.motion.end_gesture()
     settle(qtbot, document)
-    # No frame comes twice, or goes back to an earlier pose of a drag in one direction.
+    # No frame is shown twice, or returns to an earlier pose of a drag in one direction.
     assert shown == sorted(set(shown))
-    # Frames come while it is dragged, and after the last event only the one in hand and the newest.
+    # Frames arrive during the drag; after the last event, only the pending and the newest one do.
     assert n_before[-1] > 1
     assert len(shown) - n_before[-1] <= 2
     assert document.motion.frame is not None
@@ -81,7 +81,7 @@ def test_a_late_frame_is_not_told_after_the_one_that_follows_it(
     held = {0.1: threading.Event(), 0.2: threading.Event()}
 
     def starved(evaluator: FrameEvaluator, latent: npt.NDArray[np.float64]) -> PoseFrame:
-        """Be quick, but late, as a thread is that gets no core."""
+        """Report a short time, but be late, like a thread that gets no core."""
         begun.append(latent[0])
         frame = compute(evaluator, latent)
         if latent[0] in held:
@@ -200,7 +200,7 @@ def test_closing_in_a_solve_ends_the_threads(
 
 
 def endless_resolve(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
-    """Make Resolve work until it is cancelled; return what it sets when it begins and ends."""
+    """Make Resolve run until it is cancelled; return the events of its start and end."""
     working, ended = threading.Event(), threading.Event()
 
     def resolve(*_: object, job: Job, **__: object) -> None:
@@ -413,7 +413,7 @@ def test_the_newest_file_wins_and_no_file_waits_for_a_solve(
 
 
 class Knot:
-    """Refers to itself, and remembers in which thread it went."""
+    """Refers to itself, and records the thread in which it is deleted."""
 
     def __init__(self, seen: list[threading.Thread]) -> None:
         self.own, self.seen = self, seen

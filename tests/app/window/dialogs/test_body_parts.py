@@ -35,7 +35,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def own(qtbot: QtBot, editor_model: LearnedBody, home: Path) -> Iterator[MainWindow]:
-    """Return a window of a model that lies in a file of the user's."""
+    """Return a window of a model stored in a file of the user's."""
     editor_model.save(home / "dancer.safetensors")
     document = PoseDocument()
     document.tasks.open_model(home / "dancer.safetensors")
@@ -70,7 +70,7 @@ def type_name(dialog: BodyPartsDialog, name: str) -> None:
     editor.selectAll()
     QTest.keyClicks(editor, name)
     QTest.keyClick(editor, Qt.Key.Key_Return)
-    # As Qt commits it once the key has been handled.
+    # Qt commits it once the key has been handled.
     QApplication.processEvents()
     assert dialog.list.currentItem().text() == name
     assert dialog.isVisible()
@@ -106,7 +106,7 @@ def test_parts_of_an_own_model_are_edited_in_its_file_and_the_pose_stays(
     assert written.domain_order == (1, 0)
     assert headings(own) == [second[:1].upper() + second[1:], "Knee & <b>shin</b>"]
     assert rows(own) == headings(own)
-    # Nothing of the pose is lost: nor its history, locks, camera and open groups.
+    # The pose, its history, locks, camera and open groups are kept.
     assert document.history.latent is pose
     assert document.history.undo_stack.count() == steps
     assert document.motion.locked_domains == {1}
@@ -120,7 +120,7 @@ def test_parts_of_an_own_model_are_edited_in_its_file_and_the_pose_stays(
     assert np.array_equal(document.motion.frame.vertices, frame.vertices)
     assert document.motion.frame.prediction is not None
     assert document.history.model_file == str(file)
-    # Its sliders and the rest go on working.
+    # Its sliders and everything else keep working.
     document.history.undo()
     assert document.history.latent[0] != 0.3
     assert "dancer" in own.statusBar().currentMessage()
@@ -155,7 +155,7 @@ def test_a_bundled_model_is_edited_in_a_copy_that_opens_in_its_place(
     assert document.history.latent is pose
     assert document.history.undo_stack.undoText() == "Move"
     assert "my tube" in window.windowTitle()
-    # From now on it is the user's own.
+    # From here on, the model is the user's own.
     dialog = dialog_of(window)
     assert not dialog.copy_name.isVisible()
     dialog.reject()
@@ -176,7 +176,7 @@ def test_names_that_cannot_be_are_said_and_stay_to_be_put_right(own: MainWindow)
         assert dialog.refusal.isVisible()
     dialog.reject()
     assert Path(own.document.history.model_file).read_bytes() == before
-    # Nothing changed is nothing written.
+    # Without changes, nothing is written.
     dialog = dialog_of(own)
     QTest.mouseClick(dialog.save, LEFT)
     assert not dialog.isVisible()
@@ -288,7 +288,7 @@ def test_a_slider_says_what_it_does_and_its_number_in_the_tool_tip(window: MainW
         assert shown == whole[:1].upper() + whole[1:]
         assert "motion" not in shown.casefold()
         assert f"(motion {code - group.codes.start + 1})" in row.slider.toolTip()
-    # By either it is found.
+    # It can be found by either name.
     group = model.latent_space.groups[1]
     for words in (f"{group.name} motion 2", f"{group.name} {model.code_names[3]}"):
         window.sliders.filter.setText(words)

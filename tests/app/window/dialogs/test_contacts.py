@@ -1,4 +1,4 @@
-"""The dialog of the contact rules: what they leave out of the rest pose, seen and changed."""
+"""The contact rules dialog: pairs excluded in the rest pose, shown and changed."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def dialog_of(qtbot: QtBot, window: MainWindow) -> ContactsDialog:
 
 @pytest.fixture
 def body(qtbot: QtBot, window: MainWindow) -> RigBody:
-    """Open a body whose left forearm goes through its right one at rest, which counts at first."""
+    """Open a body whose forearms cross at rest, which counts at first."""
     body = rigged_body()
     assert body.rig is not None
     moved = np.where(body.rest_vertices[:, :1] > 0.5, [-1.2, 0.0, -0.01], 0.0)
@@ -59,7 +59,7 @@ def test_rules_are_applied_counted_and_tinted(
     remembered = window.settings["shading"]
     dialog = dialog_of(qtbot, window)
     assert viewport.shading is Shading.EXACT
-    # It is what the dialog shows, not what the user has chosen.
+    # This is the dialog's shading, not the user's choice.
     assert window.settings["shading"] == remembered != "exact"
     pairs = contacts_at_rest(body).n_counted
     assert pairs > 0
@@ -170,7 +170,7 @@ def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: 
     (parts,) = [item for item in top if item is not None and "Leave out meshes" in item.text(0)]
     names = [parts.child(row).text(0) for row in range(parts.childCount())]
     assert {group.name for group in body.groups_by_kind["meshes and materials"]} == set(names)
-    # Several are in sight, and more once the dialog is pulled longer.
+    # Several rows are visible, and more once the dialog is taller.
     heights = [dialog.ignored.height()]
     dialog.resize(dialog.width(), dialog.height() + 100)
     heights.append(dialog.ignored.height())
@@ -211,7 +211,7 @@ def test_meshes_and_materials_have_a_list_each_in_a_dialog_that_widens(
     }
     assert listed["Leave out meshes (2)"] == ["Axe", "Cape"]
     assert listed["Leave out materials (1)"] == ["Steel"]
-    # Meshes and materials are apart in what is chosen of, too.
+    # The choices also separate meshes from materials.
     names = [dialog.first.itemText(row) for row in range(dialog.first.count())]
     assert names[:2] + names[-2:] == ["Axe", "Cape", "", "Steel"]
     narrow, list_width = dialog.width(), dialog.ignored.width()
@@ -278,7 +278,7 @@ def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     ]
     assert dialog.rules() == body.rules
     assert not any(kind.isExpanded() for kind in kinds)
-    # It is said which to begin with, and what a row names is tinted.
+    # The first one to try is suggested, and the groups of a row are tinted.
     size = {g.name: len(g.faces) for groups in body.groups_by_kind.values() for g in groups}
     left_out = {
         kind: sum(size[pair.groups[0]] * size[pair.groups[1]] for pair in pairs)
@@ -299,7 +299,7 @@ def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     ignored = tuple(pair.groups for pair in expected["components"])
     assert dialog.rules().ignored == ignored
     take_picture(dialog, "contacts_proposed")
-    # The components are no groups of the file.
+    # Components are not groups of the file.
     QTest.mouseClick(dialog.apply, LEFT)
     qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert document.model.rules.ignored == ignored
@@ -317,7 +317,7 @@ def test_rules_are_remembered_and_go_back_to_the_defaults(
     dialog = dialog_of(qtbot, window)
     assert "remembered for this character" in dialog.kept.text()
     assert not dialog.restore.isEnabled()
-    # A limb bounds the length that a character starts with, and none that is typed.
+    # A limb's size bounds the default length, but not one that is typed.
     begin = dialog.near.value()
     for value, at_limbs in ((begin - 1.0, ""), (begin, ", less at thin limbs")):
         dialog.near.setValue(value)
@@ -348,7 +348,7 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     document, card = window.document, window.collision.proposal
     assert card.isHidden()
     body = RigBody.of(head_in_torso(30))
-    # As if these were the rules that it starts with.
+    # As if these were its default rules.
     strict = ContactRules()
     body.own_card = replace(body.own_card, rules=strict)
     with qtbot.waitSignal(document.tasks.rules_proposed, timeout=PATIENCE):
@@ -359,7 +359,7 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     assert card.isVisible()
     assert card.text.text().startswith(f"{proposed.n_colliding} of {proposed.n_poses} poses")
     assert f"{len(proposed.new)} such places not counted" in card.text.text()
-    # They are listed and tinted at once.
+    # The places are listed and tinted at once.
     scene = window.viewport.scene
     assert scene is not None
     assert scene.named.n_faces == len(proposed.faces) > 0
@@ -378,7 +378,7 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     assert document.motion.exact.excluded.touching > 0
     told = window.collision.exact.details.text()
     assert f"{document.motion.exact.excluded.touching} at places that nearly always touch" in told
-    # What the user has chosen is not questioned, nor is what has nothing to offer.
+    # Nothing is offered if the user has chosen rules, or if there is no proposal.
     document.set_model(document.model)
     qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert card.isHidden()
@@ -391,7 +391,7 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
 def test_a_crossing_in_all_frames_of_a_clip_is_offered_until_it_is_answered(
     qtbot: QtBot, window: MainWindow
 ) -> None:
-    """The rules are those that a character starts with, and its clip is short."""
+    """With default rules and a short clip."""
     document, card = window.document, window.collision.proposal
     body = RigBody.of(sunk_arm())
     assert not body.rules_are_chosen
@@ -407,7 +407,7 @@ def test_a_crossing_in_all_frames_of_a_clip_is_offered_until_it_is_answered(
     QTest.mouseClick(card.dismiss, LEFT)
     assert (card.isVisible(), scene.named.n_faces) == (False, 0)
     qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
-    # Opened again, it is not asked again; the contact rules still have the places.
+    # When reopened, it is not offered again; the dialog still has the places.
     with qtbot.waitSignal(document.tasks.rules_proposed, timeout=PATIENCE):
         document.set_model(RigBody.of(sunk_arm()))
     assert card.isHidden()

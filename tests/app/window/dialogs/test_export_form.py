@@ -55,7 +55,7 @@ def test_the_scale_follows_the_axes_and_both_are_remembered(
     qtbot.addWidget(again)
     axes, scale = fields(again)
     assert (axes.currentData(), scale.value()) == ("unreal", 2.54)
-    # Of a body in another unit the same file is as large.
+    # A body in another unit gives the same size.
     inches = model.with_card(replace(model.card, metres=0.0254))
     other = ExportDialog(window.settings, window, inches)
     qtbot.addWidget(other)
@@ -179,7 +179,7 @@ def test_a_model_keeps_the_form_of_the_file_that_it_was_learned_from(
 
 
 def chooser(change: Callable[[MotionDialog], None], path: Path, timers: list[QTimer]) -> QTimer:
-    """Return what changes the form of a motion's export and accepts it, with a file."""
+    """Return a timer that changes the motion export form and accepts it, with a file."""
     accept = accept_and_choose(path, timers)
 
     def fill(dialog: QDialog) -> None:
@@ -218,7 +218,7 @@ def test_the_motion_on_the_timeline_goes_back_into_the_character_s_file(
     after = read_character(path).sample(clip, None)
     np.testing.assert_allclose(after.times, before.times, atol=1e-6)
     np.testing.assert_allclose(after.vertices, before.vertices, atol=1e-6 * arm_model.body_size)
-    # The rate of the clip is no choice to be remembered.
+    # The clip's own rate is not remembered as a choice.
     assert window.settings["export_rate"] == SETTINGS["export_rate"].default
     assert window.settings["motion_form"] == "clip"
 
@@ -271,7 +271,7 @@ def test_files_of_a_motion_that_nobody_has_named_are_asked_about(
     window.library.list.selectAll()
     timers.append(chooser(change, tmp_path / "run.pc2", timers))
     window.actions_by_key["export_motion"].trigger()
-    # The question comes once the names of the files are known.
+    # The question comes after the file names are known.
     timers.append(answer(decide))
     qtbot.waitUntil(lambda: bool(told) and not document.tasks.busy, timeout=PATIENCE)
     assert told[0] == "Replace existing files?"
@@ -314,7 +314,7 @@ def test_poses_of_no_motion_keep_the_rate_and_form_that_were_chosen(
     take_picture(form, "export_rate")
     form.accept()
     assert window.settings["export_rate"] == 23.976
-    # A model has no clip to choose, which says nothing of the next character.
+    # A model has no clips to choose, which must not affect the next character.
     assert window.settings["motion_form"] == "clip"
 
 
@@ -341,7 +341,7 @@ def test_clips_are_kept_beside_a_pose_of_joints_where_the_box_says_so(
     qtbot.addWidget(again)
     assert again.keep_clips is not None
     assert again.keep_clips.isChecked()
-    # A model has no clips of its own.
+    # A model has no own clips.
     assert ExportDialog(window.settings, window, window.document.model).keep_clips is None
 
 

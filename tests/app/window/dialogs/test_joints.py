@@ -1,4 +1,4 @@
-"""Which joint of a motion goes where is seen, changed and remembered."""
+"""The match between joints of a motion and of the body is shown, changed and remembered."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def shown_dialogs(window: MainWindow) -> list[JointsDialog]:
 
 
 def renamed(source: Path, path: Path, names: dict[str, str]) -> Path:
-    """Write the clips of a character alone, with other names of its joints."""
+    """Write only the clips of a character, with other joint names."""
 
     def change(held: dict) -> None:  # type: ignore[type-arg]
         strip(held)

@@ -1,4 +1,4 @@
-"""In every dialog each button and named field has a letter of its own."""
+"""In every dialog, each button and labelled field has its own mnemonic."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ pytestmark = pytest.mark.one_window
 
 
 def marks(dialog: QDialog) -> dict[str, QObject]:
-    """Return what is marked by its letter, and see that all that should be is."""
+    """Return widgets by their mnemonics, and check that none lacks one."""
     labels = [held for held in dialog.findChildren(QLabel) if held.buddy() is not None]
     named = {held.buddy() for held in labels}
     buttons = [held for held in dialog.findChildren(QAbstractButton) if held.text()]
@@ -129,7 +129,7 @@ def test_a_letter_presses_its_button_also_after_its_text_has_changed(
         letter = mnemonic(dialog.unfold.text())
         key = getattr(Qt.Key, f"Key_{letter.upper()}")
         QTest.keyClick(dialog, key, Qt.KeyboardModifier.AltModifier)
-        # It is seen to be pressed for a moment.
+        # It is shown pressed for a moment.
         qtbot.waitUntil(lambda u=unfolded: dialog.unfold.isChecked() == u)
     dialog.close()
 

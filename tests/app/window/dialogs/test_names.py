@@ -1,4 +1,4 @@
-"""Names that break lines or are too long: shown in one line, refused in one sentence."""
+"""Names with line breaks or of excessive length: shown in one line, refused in one sentence."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def work(
         f"label m.safetensors -n 1 -o {LONG}",
         f"train embedding set.npz -o {LONG}",
         f"train embedding set.npz -o {LONG}.safetensors",
-        # The model's name would fit, that of its checkpoint would not.
+        # The model's name would fit, but not that of its checkpoint.
         f"train embedding set.npz -o {'x' * 236}.safetensors",
         f"train predictor m.safetensors store -o {'x' * 236}.safetensors",
         f"info m.safetensors --figure {LONG}.png",
@@ -107,7 +107,7 @@ def test_plain_names_are_shown_as_they_are() -> None:
 
 
 def named(window: MainWindow, name: str) -> None:
-    """Let a window open a file of one pose."""
+    """Open a file of one pose in a window."""
     path = Path(window.settings["last_folder"]) / "poses.json"
     model = window.document.model
     write_poses(path, model, [NamedPose(name, model.known_poses[0])])

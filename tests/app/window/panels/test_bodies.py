@@ -1,4 +1,4 @@
-"""The list of a scene's bodies: there for several, and what its boxes do."""
+"""The list of a scene's bodies: shown for several bodies, and its check boxes."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
     second = tree.topLevelItem(1)
     assert second is not None
     second.setCheckState(2, Qt.CheckState.Checked)
-    # The row outlives the click: it is used when the locks change.
+    # The row must outlive the click: it is used when the locks change.
     assert second.checkState(2) is Qt.CheckState.Checked
     assert document.motion.locked_domains == set(scene.domains_of_member("hero 2"))
     with qtbot.waitSignal(document.model_changed, timeout=PATIENCE):
@@ -131,7 +131,7 @@ def test_clips_of_a_scene_play_together_with_offsets_and_each_body_gets_its_file
     assert scene.plays["moving 2"][1] == 0.1
     first, second = (scene.codes_of_member(name, motion.codes) for name in scene.plays)
     np.testing.assert_allclose(first[:8], second[late:])
-    # It is kept, as the file of the scene says it.
+    # The choice is stored in the scene's file.
     assert open_scene_file(document.history.model_file).plays == scene.plays
     out = tmp_path / "out"
     out.mkdir()
@@ -173,12 +173,12 @@ def test_the_ground_counts_where_it_is_wanted(qtbot: QtBot, hero: Path, tmp_path
     assert [member.is_ground for member in scene.members] == [False, True]
     assert toggle.isChecked()
     assert window.docks["bodies"].isHidden()
-    # The view has a floor of its own, and looks at the body.
+    # The view has its own floor, and looks at the body.
     hidden = window.bodies.hidden_faces
     assert hidden is not None
     np.testing.assert_array_equal(np.flatnonzero(hidden), np.r_[scene.faces_of["ground"]])
     assert len(scene.without_ground(scene.reference)) == scene.n_vertices - 4
-    # It is in the same pose, in which it stands in the ground now.
+    # The pose is the same, but now penetrates the ground.
     np.testing.assert_array_equal(document.history.latent, sunk)
     assert not scene.exact_check().is_free(sunk)
     with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):

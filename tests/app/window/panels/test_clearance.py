@@ -1,4 +1,4 @@
-"""The clearance in the window: its field, what Resolve and Solid keep, and where it is least."""
+"""The clearance in the window: its field, Resolve and Solid, and the nearest pair."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_of_a_character_it_is_in_millimetres(qtbot: QtBot, body_window: MainWind
     size = 1000.0 * model.card.metres * model.body_size
     assert field.suffix() == " mm"
     assert field.value() == pytest.approx(DEFAULT * size, abs=0.005)
-    # Showing it in another unit changes nothing.
+    # Showing it in another unit does not change it.
     assert body_window.document.motion.clearance == DEFAULT
     field.setValue(0.002 * size)
     assert body_window.document.motion.clearance == pytest.approx(0.002, abs=0.01 / size)
@@ -120,7 +120,7 @@ def test_a_press_shows_where_the_pose_comes_nearest(
     before = scene.view
     button.click()
     assert scene.named.n_faces > 2
-    # The camera comes to look at it.
+    # The camera moves to look at it.
     nearest = window.document.motion.nearest
     assert nearest is not None
     middle = nearest.points.mean(axis=0)
@@ -132,7 +132,7 @@ def test_a_press_shows_where_the_pose_comes_nearest(
     button.click()
     assert scene.named.n_faces == 0
     button.click()
-    # Another pose, which comes nowhere near itself.
+    # Another pose, which is nowhere near itself.
     go_to(qtbot, window, np.zeros_like(colliding))
     assert scene.named.n_faces == 0
     assert not button.isChecked()
@@ -154,7 +154,7 @@ def test_solid_keeps_the_clearance_and_shows_no_collision_that_is_none(
     reached = document.history.latent
     assert np.abs(reached - body.free_latent[0]).max() > 0.01
     assert body.exact_check(clearance=DEFAULT).is_free(reached)
-    # From there, with more asked for, the pose is too near and yet collides with nothing.
+    # With a larger clearance, the resolved pose is too near, although nothing collides.
     window.collision.resolve.clearance.setValue(5.0)
     assert not body.exact_check(clearance=0.05).is_free(reached)
     document.motion.set_code(0, float(reached[0]) + 0.01)

@@ -1,4 +1,4 @@
-"""The right panel: it has the space it needs, and separates the estimate from the exact check."""
+"""The right panel: enough space, and an estimate separate from the exact check."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_the_panel_keeps_the_width_that_its_cards_need_also_where_settings_say_l
 
 
 def has_room(window: MainWindow) -> bool:
-    """Whether nothing of the panel is cut off at its right, with a scroll bar beside it."""
+    """Whether nothing is cut off at the panel's right, even beside a scroll bar."""
     area = scrolled(window)
     bar = area.verticalScrollBar().sizeHint().width()
     return area.width() >= area.widget().minimumSizeHint().width() + bar
@@ -157,7 +157,7 @@ def test_the_headline_keeps_what_it_says_and_its_height_until_the_next_check(
     for value in np.linspace(0.0, 1e-3, 20):
         document.motion.set_code(0, float(colliding[0] + value))
         qtbot.wait(5)
-        # A frame that comes at once brings picture and verdict together; until then both stay.
+        # A quick frame brings picture and verdict together; until then, both stay.
         if document.motion.exact is None and not document.motion.expects_frame:
             before = [text.replace("on the mesh", "previous pose") for text in told]
             assert texts(card) == before != told
@@ -169,13 +169,13 @@ def test_the_headline_keeps_what_it_says_and_its_height_until_the_next_check(
     rest(qtbot, window)
     assert not card.is_of_the_pose_before
     assert "previous pose" not in texts(card)
-    # From one verdict to the other nothing moves either.
+    # The layout does not move from one verdict to another either.
     document.motion.blend_towards(np.zeros_like(colliding), 1.0)
     rest(qtbot, window)
     assert card.verdict.text() == "No collisions (checked)"
     assert card.height() == height
     assert [child.geometry() for child in card.findChildren(QLabel)] == places
-    # What another model's pose was found to be says nothing about this one.
+    # The verdict on another model's pose does not apply to this one.
     document.set_model(document.model)
     assert card.verdict.text() == "Checking…"
     assert not card.is_of_the_pose_before
@@ -274,7 +274,7 @@ def test_the_ghost_goes_and_comes_back_with_the_result_it_belongs_to(
     assert seen() == (False, False)
     window.actions_by_key["undo"].trigger()
     assert seen() == (True, True)
-    # Nothing to do: it has no ghost, and that of the Resolve before is not its.
+    # A Resolve with nothing to do has no ghost, not even the previous one's.
     assert resolve(qtbot, window).latent_distance == 0.0
     assert seen() == (True, False)
 

@@ -1,4 +1,4 @@
-"""The library in the window, by mouse and keyboard: kept poses stay as they are."""
+"""The library in the window, by mouse and keyboard: kept poses do not change."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def apply(qtbot: QtBot, window: MainWindow, name: str) -> None:
 
 
 def typing(text: str) -> Callable[[QDialog], None]:
-    """Return what types a name and Enter into a dialog that asks for one."""
+    """Return a function that types a name and Enter into a name dialog."""
 
     def act(dialog: QDialog) -> None:
         assert isinstance(dialog, NameDialog)
@@ -109,7 +109,7 @@ def type_name(dialog: QDialog, text: str) -> None:
 
 
 def choosing(path: Path) -> Callable[[QDialog], None]:
-    """Return what types a file's name and Enter into a dialog that asks for one."""
+    """Return a function that types a file name and Enter into a file dialog."""
 
     def act(dialog: QDialog) -> None:
         field = name_field(dialog)
@@ -120,7 +120,7 @@ def choosing(path: Path) -> Callable[[QDialog], None]:
 
 
 def pressing(text: str) -> Callable[[QDialog], None]:
-    """Return what presses a button of a question."""
+    """Return a function that presses a button of a question."""
 
     def act(dialog: QDialog) -> None:
         assert isinstance(dialog, QMessageBox)
@@ -131,7 +131,7 @@ def pressing(text: str) -> Callable[[QDialog], None]:
 
 
 def press(window: QWidget, key: Qt.Key, modifiers: Qt.KeyboardModifier, *acts: object) -> None:
-    """Press a shortcut, answer the dialogs that come one by one, and wait for what is saved."""
+    """Press a shortcut, answer the dialogs one by one, and wait until all is saved."""
     waiting = [act for act in acts if callable(act)]
     timers: list[QTimer] = []
 
@@ -146,7 +146,7 @@ def press(window: QWidget, key: Qt.Key, modifiers: Qt.KeyboardModifier, *acts: o
             timers.append(answer(answered))
 
     expect()
-    # Without a window manager nothing is active once a dialog has closed.
+    # Without a window manager, no window is active after a dialog has closed.
     window.activateWindow()
     assert QTest.qWaitForWindowActive(window)
     QTest.keyClick(window, key, modifiers)
@@ -349,7 +349,7 @@ def test_search_and_tags_find_poses(window: MainWindow) -> None:
     click(window, "T pose", key=CONTROL)
     document.library.tag_poses(["T pose"], ["arms"])
     press(window, Qt.Key.Key_T, CONTROL | SHIFT, typing("leg, low"))
-    # What is not shared was not there to be deleted.
+    # Tags that are not shared were not shown, so they are not deleted.
     press(window, Qt.Key.Key_T, CONTROL | SHIFT, typing("leg, high & wide,leg"))
     assert [pose.tags for pose in document.library.poses] == [
         ("leg", "high & wide"),
@@ -373,7 +373,7 @@ def test_search_and_tags_find_poses(window: MainWindow) -> None:
     library.search.clear()
     {action.text(): action for action in library.tags.menu().actions()}["All poses"].trigger()
     assert len(names_shown(window)) == 3
-    # One that is kept is shown whatever was searched for.
+    # An added pose is shown whatever the search text.
     library.search.setText("nothing")
     press(window, Qt.Key.Key_K, CONTROL, typing("new"))
     assert library.chosen_own is not None
@@ -422,7 +422,7 @@ def test_the_context_menu_has_the_menu_s_own_actions(qtbot: QtBot, window: MainW
 
 
 def noting(threads: list[str], work: Callable[..., Any]) -> Callable[..., Any]:
-    """Return what does the same, and notes the thread's name where that is one of the program's."""
+    """Return a wrapper that records the thread's name if it is one of the program's threads."""
 
     def noted(*arguments: Any, **options: Any) -> Any:
         threads.append(QThread.currentThread().objectName())
@@ -463,7 +463,7 @@ def test_a_library_is_shared_as_a_file(
     assert "Added 3 poses" in window.statusBar().currentMessage()
     press(window, Qt.Key.Key_I, CONTROL | SHIFT, choosing(some))
     qtbot.waitUntil(lambda: len(own(window)) == 5, timeout=PATIENCE)
-    # The window's thread is nowhere among them.
+    # The window's thread is not among them.
     assert threads == ["saving", "saving", "long work", "long work"]
     press(window, Qt.Key.Key_Z, CONTROL)
     press(window, Qt.Key.Key_Z, CONTROL)
@@ -509,7 +509,7 @@ def test_save_asks_before_it_replaces_what_another_program_wrote_meanwhile(
     with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         drop(window, path)
     document.motion.set_code(0, 0.25)
-    # No other program has written it: no question.
+    # No other program has written the file, so there is no question.
     press(window, Qt.Key.Key_S, CONTROL)
     assert not document.history.modified
     write_poses(path, document.model, [NamedPose("of another", latent[2])])

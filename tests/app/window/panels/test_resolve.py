@@ -1,4 +1,4 @@
-"""What the card of Resolve says where nothing could be done, and how long it really took."""
+"""The Resolve card: its text when nothing could be done, and the elapsed time."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_that_all_body_parts_are_locked_is_said_before_and_after_resolve(
     assert [text for text in texts(outcome) if text.endswith(" %, as before")]
     assert "No search was needed" not in texts(outcome)
     assert outcome.converged.sign.name == "info"
-    # A free pose needs none, locked or not.
+    # A free pose needs no Resolve, locked or not.
     document.motion.load_pose(NamedPose("mean", np.zeros_like(colliding)))
     assert resolve(qtbot, window).exactly_free
     assert "No search was needed" in texts(outcome)
@@ -134,7 +134,7 @@ def test_the_time_told_is_what_was_waited_as_well(
         f" {seconds_text(document.history.state.outcome_seconds - 0.194)} of preparation"
     )
     assert document.history.state.outcome_seconds >= 0.8
-    # Undo and redo bring the same times back.
+    # Undo and redo restore the same times.
     document.history.undo()
     document.history.redo()
     assert told in texts(card)

@@ -1,4 +1,4 @@
-"""The panels round the viewport: whose pose an action changes, and what a slider is called."""
+"""The panels around the viewport: which pose an action changes, and slider names."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_the_poses_of_a_file_that_is_opened_are_shown_beside_the_library(
     QTest.mouseClick(library.add_button, LEFT)
     assert own_names(window) == ["mine", "kick", "jump"]
     assert "already" in window.statusBar().currentMessage()
-    # Another model has no file, and the library that it had.
+    # Another model starts without a file, and with its own library.
     document.set_model(document.model)
     document.tasks.wait_for_saves()
     assert own_names(window) == ["mine", "kick", "jump"]
@@ -275,7 +275,7 @@ def test_what_can_be_typed_is_near_the_sliders_range(qtbot: QtBot, window: MainW
         assert type_in(far) == before
     for limit in (low - beyond, high + beyond):
         assert f"{limit:.3f}" in row.field.toolTip()
-    # What comes from a file may be further away: it is shown as it is, and stays so.
+    # Values from a file may exceed the range: they are shown and kept unchanged.
     pose = document.history.latent.copy()
     pose[1] = high + 10.0 * beyond + 1e-5
     document.motion.blend_towards(pose, 1.0)
@@ -341,7 +341,7 @@ def test_a_cleared_filter_leaves_the_groups_folded_as_they_were(window: MainWind
     assert folds(window) == before
     assert not says(panel, "No matching sliders")
     assert shown_codes(window) == [row.code for row in panel.groups[2].rows]
-    # Another time, from other folds.
+    # Again, from other open groups.
     QTest.mouseClick(panel.groups[2].header, LEFT)
     QTest.keyClicks(panel.filter, "motion")
     assert any(folds(window))
@@ -416,7 +416,7 @@ def test_a_double_click_far_from_the_handle_resets_in_one_step(
     assert document.history.undo_stack.count() == 1
     document.history.undo()
     assert document.history.latent[1] == 0.25
-    # One that takes nothing back leaves the steps before.
+    # A double-click that cancels nothing leaves the earlier steps.
     double_click(slider, far, Qt.MouseButton.RightButton)
     assert document.history.latent[1] == 0.25
     rest(qtbot, window)
@@ -444,7 +444,7 @@ def test_escape_ends_the_drag_of_a_slider_and_no_work(
     QTest.mouseRelease(slider, LEFT, pos=middle)
     assert np.array_equal(document.history.latent, before)
     assert not document.history.undo_stack.canUndo()
-    # Without a drag it is the window's.
+    # Without a drag, the key belongs to the window.
     with qtbot.waitSignal(document.message) as told:
         QTest.keyClick(slider, Qt.Key.Key_Escape)
     assert told.args == ["Exporting a.obj was cancelled"]
@@ -477,7 +477,7 @@ def test_a_slider_tells_assistive_technologies_what_is_shown(
     low, high = (float(end[code]) for end in (model.latent_space.low, model.latent_space.high))
     assert value.minimumValue() == pytest.approx(np.degrees(low), abs=1.0)
     assert value.maximumValue() == pytest.approx(np.degrees(high), abs=1.0)
-    # They may set it, too; and what is between two degrees is kept.
+    # They may set it, too; values between two degrees are kept.
     value.setCurrentValue(30)
     rest(qtbot, window)
     assert document.history.latent[code] == pytest.approx(np.radians(30.0))

@@ -1,4 +1,4 @@
-"""The painted part of the timeline: what it shows of each frame, and where one clicks and drags."""
+"""The painted part of the timeline: the display of frames, clicks and drags."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def strip(qtbot: QtBot, theme: Theme) -> TimelineStrip:  # noqa: ARG001 - it is 
 
 
 def shown(qtbot: QtBot, n_frames: int, width: int = 900) -> TimelineStrip:
-    """Show a motion of which nothing is known."""
+    """Show a motion without any checked frames."""
     strip = TimelineStrip()
     qtbot.addWidget(strip)
     strip.resize(width, strip.sizeHint().height())
@@ -63,12 +63,12 @@ def exact_row(strip: TimelineStrip) -> range:
 
 
 def column(strip: TimelineStrip, image: QImage, frame: int) -> list[QColor]:
-    """Return the pixels of the exact check at a frame, off the playhead's line."""
+    """Return the exact check's pixels at a frame, beside the playhead's line."""
     return [image.pixelColor(middle(strip, frame), y) for y in exact_row(strip)]
 
 
 def is_warm(colour: QColor) -> bool:
-    """Tell whether a colour is one of those of an overlap, which are red to orange."""
+    """Return whether a colour is one for penetration, red to orange."""
     return colour.saturation() > 60 and (colour.hue() < 40 or colour.hue() > 340)
 
 
@@ -77,7 +77,7 @@ def is_green(colour: QColor) -> bool:
 
 
 def wheel(strip: TimelineStrip, x: float, notches: QPoint, keys: Qt.KeyboardModifier) -> bool:
-    """Turn the wheel; return whether the strip took it."""
+    """Turn the wheel; return whether the strip accepted it."""
     at = QPointF(x, 40.0)
     event = QWheelEvent(
         at,
@@ -293,7 +293,7 @@ def test_the_handles_of_the_range_are_dragged(qtbot: QtBot, strip: TimelineStrip
     assert ranges == [(25, 60)]
     drag(strip, QPoint(out_handle, 12), QPoint(round(track.x_of(51)), 12))
     assert ranges == [(25, 60), (25, 50)]
-    # Neither passes the other, or leaves the motion.
+    # Neither point passes the other, nor leaves the motion.
     drag(strip, QPoint(round(track.x_of(51)) + 5, 12), QPoint(round(track.x_of(3)), 12))
     assert ranges[-1] == (25, 25)
     drag(strip, QPoint(round(track.x_of(26)) + 5, 12), QPoint(strip.width() + 90, 12))
