@@ -318,7 +318,7 @@ class ResolveOptions:
     still_domains : indices of domains whose vertices should stay in place, as pinned ones do,
         though their codes may change
     standing : unit vector away from the ground: parts that stand on it in the pose should stay in
-        place too, for which a body that has a whole-body shift is moved; None if nothing stands
+        place too, and a body that can be shifted is moved as a whole for it; None if nothing stands
     group_weights : 1 + K numbers > 0 for (Z_0, Z_1, ..., Z_K), factors of the cost of moving each
         group; by default all 1
     time_budget : seconds after which the ladder goes straight to its last step; None for no limit.

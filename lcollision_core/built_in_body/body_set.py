@@ -304,7 +304,7 @@ def relax(
     """
     start = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     pairs = np.unique(np.concatenate([start, start[:, ::-1]]), axis=0)
-    # A rim vertex slides only along the rim; its neighbours would pull it off a ridge.
+    # A rim vertex slides only along the rim; inner neighbours would pull it off a ridge.
     pairs = pairs[~on_rim[pairs[:, 0]] | on_rim[pairs[:, 1]]]
     degree = np.bincount(pairs[:, 0], minlength=len(vertices))
     for _ in range(n):

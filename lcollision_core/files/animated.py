@@ -1,4 +1,4 @@
-"""Files that hold poses of one mesh over time: clips of scenes, and point caches."""
+"""Read poses of one mesh over time: clips of scenes, and point caches."""
 
 from __future__ import annotations
 

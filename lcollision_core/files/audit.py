@@ -1,4 +1,4 @@
-"""Defects of a mesh or a pose set, in plain sentences."""
+"""Find defects of a mesh or a pose set, described in plain sentences."""
 
 from __future__ import annotations
 

@@ -266,7 +266,7 @@ def read_character(
     MeshFileError : the file is missing, damaged, compressed or too large, or shows no triangles.
         The message names the file. A damaged clip is left out, or refused when it is sampled.
     MissingExtraError : the extra `fbx`, which reads FBX, is not installed.
-    ShapeError : `up` is no axis.
+    ShapeError : `up` is not an axis.
     """
     if not isinstance(source, SceneDocument) and Path(source).suffix.lower() == SMPL_SUFFIX:
         character = character_of_smpl(read_smpl(source))

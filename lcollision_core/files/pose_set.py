@@ -138,7 +138,7 @@ def texts_of(value: npt.NDArray[np.str_], name: str, most: int) -> tuple[str, ..
 
     Raises
     ------
-    MeshFileError : a character does not exist.
+    MeshFileError : a code point is beyond Unicode.
     """
     native = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("="))
     if (native.view(np.uint32) > sys.maxunicode).any():
@@ -170,7 +170,7 @@ def provenance_from_arrays(arrays: Arrays) -> dict[str, Any]:
 
 
 FORMAT_VERSION = 2
-"""The latest version that is read; sets that need none of its rules are written as version 1."""
+"""The latest version that is read; sets without the rules it added are written as version 1."""
 
 _MESH_ARRAYS = (("vertices", "V"), ("faces", "F"))
 _EXTRA_ARRAYS = (

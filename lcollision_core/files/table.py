@@ -117,7 +117,7 @@ def suffixes_of(holds: Holds, *, written: bool = False) -> tuple[str, ...]:
 
 
 def function_of(name: str) -> Any:
-    """Return a reader or writer by its name in the table."""
+    """Import a reader or writer by its name in the table."""
     module, function = name.split(":")
     return getattr(import_module(f"lcollision_core.{module}"), function)
 

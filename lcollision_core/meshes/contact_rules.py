@@ -156,16 +156,16 @@ class ContactRules:
     near_by_limb : whether the near exclusion holds only for faces that are also near in space at
         rest: within twice the limb's thickness at the nearest joint, the thinner of the two, given
         by the groups about joints
-    rest_exclusion : pairs that touch at rest do not count, nor do pairs whose faces are within this
-        distance of the two faces of such a pair; 0 excludes those pairs only, None none. Faces
-        touch at rest if they collide or lie on each other.
+    rest_exclusion : pairs that touch at rest do not count, nor do pairs with one face within this
+        distance of each face of such a pair; 0 excludes touching pairs only, None none. Faces touch
+        at rest if they collide or lie on each other.
     ignored : pairs of names of groups; a pair of one face from each group does not count
     tolerated_depth : pairs up to this penetration depth do not count; deeper ones count with all
         of it
     joint_exclusion : whether pairs do not count if both faces lie about one joint, as given by the
         groups of a rig: see `FaceGroup.about_joint`
-    touching : pairs of faces at the centres of patches that touch in nearly every pose; pairs whose
-        faces are within the touching radius of the two do not count
+    touching : pairs of faces at the centres of patches that touch in nearly every pose; pairs with
+        one face within the touching radius of each of the two do not count
     touching_radius : radius of these patches
     left_out : names of groups whose pairs do not count; they are still posed, shown and exported
     tolerated_pairs : pairs of names of groups with a depth that replaces the tolerated depth for

@@ -40,7 +40,7 @@ class Limbs:
     owner : (D,) int64 array, the segment that each code moves
     is_relative : whether codes turn a segment relative to its parent and those of the root move the
         whole body; else segments turn in space, and the body has no whole-body shift
-    bases : segments on which all limbs hang that stand at rest: a drag of one holds the root
+    bases : segments that carry all limbs standing at rest; a drag of one holds the root
     """
 
     parents: npt.NDArray[np.int64]
@@ -87,7 +87,7 @@ class Limbs:
 
     @cached_property
     def tops(self) -> npt.NDArray[np.int64]:
-        """(S,) the segment at which the arm, leg or other long limb of each segment begins."""
+        """(S,) top segment of the arm, leg or other long limb of each segment."""
         limb_tops = [self.limb(segment, LEAST_LIMB)[-1] for segment in range(len(self.parents))]
         return np.array(limb_tops)
 
@@ -98,7 +98,7 @@ class Limbs:
 
     @cached_property
     def _own_tops(self) -> npt.NDArray[np.int64]:
-        """(S,) the segment at which the limb of each segment begins, however short it is."""
+        """(S,) top segment of the limb of each segment, however short it is."""
         return np.array([self.limb(segment)[-1] for segment in range(len(self.parents))])
 
     @cached_property

@@ -132,7 +132,7 @@ def moved_normals(
     changes[owners[(old != new).any(axis=(1, 2))]] = True
     counts = changes[owners] & ~_is_thin(old) & ~_is_thin(new)
     owners, old, new = owners[counts], old[counts], new[counts]
-    # The map takes the rows of `old` to those of `new`: new^T old^-T, whose inverse transpose is
+    # The map from the rows of `old` to those of `new` is new^T old^-T; its inverse transpose is
     # new^-1 old.
     turned = np.linalg.solve(new, old @ normals[owners][:, :, None])[:, :, 0]
     lengths = np.linalg.norm(turned, axis=1, keepdims=True)

@@ -421,10 +421,10 @@ def _driven(
     for channel in animation.get("channels", ()):
         node, path = driven_property(channel)
         if node is None:
-            continue  # Driven by an extension.
+            continue  # An extension defines the target.
         element(nodes, node, f"a node of {where}")
         if path not in (*PARTS, _WEIGHTS):
-            continue  # The property of an extension.
+            continue  # An extension defines the property.
         width = n_targets.get(node, 0) if path == _WEIGHTS else len(PARTS[path])
         if width:
             samplers = animation.get("samplers")

@@ -178,7 +178,7 @@ class GltfLooks:
             finish,
             material=replace(finish.material, texture=self._texture(laid.get("index"))),
             uv_set=whole(uv_set, "its set of texture coordinates", 0, _MOST_UV_SETS),
-            # Counter-clockwise, where v goes down.
+            # Counter-clockwise, as v points down.
             turned=np.array([[cosine, sine], [-sine, cosine]]) * scale,
             offset=numbers(moved.get("offset", [0.0, 0.0]), "its texture's offset", 2),
         )

@@ -1,4 +1,4 @@
-"""Object File Format (OFF), text form.
+"""Object File Format (OFF), as text.
 
 It has its own reader because trimesh reorders the triangles of quads, drops truncated faces without
 an error, and writes ten digits.

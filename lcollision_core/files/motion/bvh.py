@@ -313,8 +313,7 @@ _WRITTEN_AXES = "ZXY"
 """Order of the rotations, the most common one."""
 
 _STILL = 1e-6
-"""Largest movement of a joint relative to its parent, in extents of the skeleton, that is ignored.
-"""
+"""Largest movement of a joint relative to its parent that is ignored, in skeleton extents."""
 
 _PER_JOINT = "Xposition Yposition Zposition ", " ".join(f"{axis}rotation" for axis in _WRITTEN_AXES)
 

@@ -168,7 +168,7 @@ def is_smpl_motion(path: str | os.PathLike[str]) -> bool:
 
 
 def read_smpl_motion(path: str | os.PathLike[str], hands: _Hands | None = None) -> SmplMotion:
-    """Read a motion.
+    """Read a motion of a body model.
 
     Parameters
     ----------

@@ -145,7 +145,7 @@ class FbxLooks:
         numbers = np.append(looks[prefix + "materials"], len(materials) - 1)
         chosen = np.where(laid.material_of < len(numbers) - 1, laid.material_of, -1)
         material_of = numbers[chosen]
-        # All triangles of a polygon have its material.
+        # Corners are not shared between polygons, so each has one material.
         of_corner = np.zeros(n, dtype=np.int64)
         of_corner[faces] = material_of[:, None]
         # A texture replaces the colour of its material.

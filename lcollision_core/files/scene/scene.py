@@ -153,7 +153,7 @@ class Clip:
 
     @cached_property
     def key_times(self) -> FloatArray:
-        """(T,) float64 array, ascending, in seconds, T > 0.
+        """(T,) float64 array of ascending times in seconds, T > 0.
 
         Raises
         ------
@@ -356,7 +356,7 @@ def is_mirrored(turns: FloatArray, bone_of: npt.NDArray[np.int32], weights: Floa
     Parameters
     ----------
     turns : (B, 4, 4) array, from a part's coordinates to the scene's by each bone
-    bone_of, weights : of the part
+    bone_of, weights : bones and weights of the part's vertices
     """
     # Numbers that are too large are refused with the vertices.
     with np.errstate(all="ignore"):
@@ -481,8 +481,8 @@ def _wound(part: Part, before: FloatArray, after: FloatArray, moved: Sequence[in
 def _seen_parts(scene: Scene) -> list[int]:
     """Return the indices of the parts that are visible at rest; all if none is.
 
-    Beside a skinned body, leave out unskinned parts whose nodes are all singular, as they could not
-    be posed.
+    Beside a skinned body, leave out unskinned parts whose node and its ancestors are all singular,
+    as they could not be posed.
     """
     rest = scene.rest.transforms[0]
     sizes = np.array([_largest_size(part, rest) for part in scene.parts])
