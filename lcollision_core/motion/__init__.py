@@ -1,4 +1,4 @@
-"""Motions: which frames collide, and the same motion free of collisions and as smooth as before."""
+"""Motions: find the frames that collide, and resolve them as smoothly as the motion was."""
 
 from lcollision_core.motion.contacts import ContactReport, KeptContacts
 from lcollision_core.motion.frames import (

@@ -1,4 +1,4 @@
-"""Contacts that a motion is to keep: patches of the body on each other, and on the ground."""
+"""Contacts that a motion should keep: patches of the body on each other, and on the ground."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import PoseSpace
 
 TOGETHER = 0.005
-"""Normalised: patches that are no farther apart are together, and so is one with the ground."""
+"""Normalised distance up to which two patches, or a patch and the ground, are together."""
 
 _AIM, _BELOW = 0.002, 0.001
-"""Normalised: how near patches are brought, and how far below the ground they may stay."""
+"""Normalised distance to which patches are brought, and depth below the ground that is allowed."""
 
 _ANCHORED = 2e-4
-"""Normalised: what stands still on the ground is no farther from its place."""
+"""Normalised distance from its place up to which an anchored patch stands still."""
 
 _MOST_PAIRS = 48
-"""Of faces of two patches whose distance is measured, those whose middles are nearest."""
+"""Most pairs of faces of two patches whose distance is measured, the nearest ones."""
 
 KEPT_SHARE = 0.95
-"""Share of its frames in which a contact is together, if it is kept."""
+"""Share of its frames in which a contact must be together to count as kept."""
 
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """Two patches of a body that are to touch in a frame, or one that is to be on the ground.
+    """Two patches of a body that should touch in a frame, or one that should be on the ground.
 
     Attributes
     ----------
-    contact : the number of the contact that it belongs to
+    contact : the index of its contact
     first : (m,) faces
     second : (n,) faces; None for the ground
-    anchor : (3,) where the mean of the first patch is to be along the ground, normalised; None
-        where it slides or is not on the ground
+    anchor : (3,) normalised target of the first patch's mean along the ground; None if it slides or
+        is not on the ground
     """
 
     contact: int
@@ -50,15 +50,15 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class Pulls:
-    """What brings the patches of one frame together, to first order in its D codes.
+    """Constraints that bring the patches of one frame together, to first order in its D codes.
 
     Attributes
     ----------
-    apart : numbers of touches that are not together
-    n_off : how many are not in their place on the ground
-    lack : what all of them are too far apart, normalised
+    apart : indices of touches that are not together
+    n_off : number of touches that are not in their place on the ground
+    lack : sum of the distances that they lack, normalised
     normals, offsets : (M, D) and (M,): normals Z <= offsets
-    standing, places : the same of equations, of what stands in its place
+    standing, places : the same for equations, of patches that stand in their place
     """
 
     apart: tuple[int, ...]
@@ -71,20 +71,20 @@ class Pulls:
 
     @property
     def n_apart(self) -> int:
-        """How many touches are not together, or not in their place on the ground."""
+        """The number of touches that are not together, or not in their place on the ground."""
         return len(self.apart) + self.n_off
 
 
 @dataclass(frozen=True, eq=False)
 class KeptContacts:
-    """What touches in each frame of a motion.
+    """The touches in each frame of a motion.
 
     Attributes
     ----------
     touches : of each of T frames
     names : of each contact, two body parts or one and "ground"
     up : (3,) unit vector
-    ground : its height along that, normalised
+    ground : its height along `up`, normalised
     """
 
     touches: Sequence[Sequence[Touch]]
@@ -93,17 +93,17 @@ class KeptContacts:
     ground: float
 
     def at(self, frames: Iterable[int]) -> KeptContacts:
-        """Return the contacts of some frames, in their order."""
+        """Return the contacts of the given frames, in their order."""
         return replace(self, touches=[self.touches[frame] for frame in frames])
 
     def without(self, frames: Iterable[int]) -> KeptContacts:
-        """Return them without those of some frames."""
+        """Return the contacts without those of some frames."""
         left_out = set(frames)
         touches = enumerate(self.touches)
         return replace(self, touches=[() if at in left_out else touch for at, touch in touches])
 
     def without_touches(self, numbers: Mapping[int, Sequence[int]]) -> KeptContacts:
-        """Return them without some touches of some frames."""
+        """Return the contacts without some touches, given by frame."""
         kept = (
             [touch for number, touch in enumerate(own) if number not in numbers.get(at, ())]
             for at, own in enumerate(self.touches)
@@ -118,12 +118,12 @@ class KeptContacts:
         return np.stack([across, np.cross(self.up, across)])
 
     def apart(self, space: PoseSpace, frame: int, vertices: FloatArray) -> list[float]:
-        """Return how far apart the patches of a frame's touches are, normalised.
+        """Return the normalised distances between the patches of a frame's touches.
 
         Parameters
         ----------
         space : of the body's poses
-        vertices : (V, 3) of the frame, normalised, in the model's frame
+        vertices : (V, 3) of the frame, normalised, in model coordinates
         """
         faces = space.topology.faces
         return [abs(self._gap(faces, touch, vertices)[0]) for touch in self.touches[frame]]
@@ -134,12 +134,12 @@ class KeptContacts:
         return mean
 
     def pulls(self, space: PoseSpace, frame: int, codes: FloatArray, vertices: FloatArray) -> Pulls:
-        """Return what brings the patches of a pose together.
+        """Return the constraints that bring the patches of a pose together.
 
         Parameters
         ----------
         space : of the frame's poses
-        codes, vertices : (D,) and (V, 3) of the pose, normalised, in the model's frame
+        codes, vertices : (D,) and (V, 3) of the pose, normalised, in model coordinates
         """
         faces, slopes, bounds, level = space.topology.faces, list[FloatArray](), list[float](), []
         apart, n_off, lack = list[int](), 0, 0.0
@@ -184,9 +184,9 @@ class KeptContacts:
     def _gap(
         self, faces: npt.NDArray[np.int32], touch: Touch, vertices: FloatArray
     ) -> tuple[float, npt.NDArray[np.integer], FloatArray]:
-        """Return how far the patches of a touch are apart, and its derivative by some vertices.
+        """Return the signed distance of a touch's patches, vertices, and the derivative by them.
 
-        Below 0 they penetrate, or are below the ground.
+        It is negative if they penetrate, or are below the ground.
         """
         if touch.second is None:
             corners = np.unique(faces[touch.first])
@@ -210,7 +210,7 @@ class KeptContacts:
 def _near_pairs(
     first: FloatArray, second: FloatArray
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Return which of (m, 3, 3) and (n, 3, 3) triangles to measure: of the nearest middles."""
+    """Return the indices of the nearest pairs of (m, 3, 3) and (n, 3, 3) triangles, by bounds."""
     middles = first.mean(axis=1)[:, None] - second.mean(axis=1)[None]
     radii = [
         np.linalg.norm(side - side.mean(axis=1)[:, None], axis=2).max(axis=1)
@@ -224,15 +224,16 @@ def _near_pairs(
 
 @dataclass(frozen=True)
 class ContactReport:
-    """How much of what touches in a motion does so in a form of it.
+    """How far a version of a motion keeps the motion's contacts.
 
     Attributes
     ----------
-    kept, lost : pairs of body parts, or one and "ground", by contact: it is kept where the patches
-        are together in nearly all of its frames
-    n_frames, n_together : frames of contacts, each counted for each contact, and those together
-    slide : the farthest that a patch that stands still moves along the ground from one frame to the
-        next, normalised
+    kept, lost : pairs of body parts, or one and "ground", by contact; a contact is kept if the
+        patches are together in nearly all of its frames
+    n_frames, n_together : number of frames with contacts, counted per contact, and of those that
+        are together
+    slide : largest normalised motion of an anchored patch along the ground from one frame to the
+        next
     """
 
     kept: tuple[tuple[str, str], ...] = ()
@@ -242,7 +243,7 @@ class ContactReport:
     slide: float = 0.0
 
     def to_json(self) -> dict[str, object]:
-        """Return what reports hold of it."""
+        """Return the values for reports."""
         return {
             "kept": [list(names) for names in self.kept],
             "lost": [list(names) for names in self.lost],
@@ -258,11 +259,11 @@ class ContactReport:
         decoded: Callable[[int], FloatArray],
         space: PoseSpace,
     ) -> ContactReport:
-        """Measure a motion of as many frames.
+        """Measure a motion with as many frames as the contacts.
 
         Parameters
         ----------
-        decoded : (V, 3) of a frame, normalised, in the model's frame
+        decoded : returns (V, 3) vertices of a frame, normalised, in model coordinates
         space : of the body's poses
         """
         count = np.zeros((len(contacts.names), 2), dtype=np.int64)

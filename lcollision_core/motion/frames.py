@@ -1,4 +1,4 @@
-"""Frames of a motion, each freed by itself, screened before and guarded after."""
+"""Frames of a motion: resolve each alone, check them before, and guard against faults after."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ HalfSpacesOfPose = tuple[FloatArray, FloatArray]
 
 
 _BLOCK = 8
-"""Frames that a thread looks at in one go."""
+"""Frames that a thread checks in one go."""
 
 _Frames = TypeVar("_Frames", bound=Sequence[int])
 
@@ -47,16 +47,16 @@ class Frames:
 
     Attributes
     ----------
-    motion : as it was
+    motion : the original
     resolver : of the body's poses
     options : of single frames
-    pool : runs what is of one frame
+    pool : runs the work of single frames
     job : polled for each frame
-    continuous : whether poses between frames also count with their vertices half-way between those
-        of both frames, not only with their codes
-    spare : >= 0, normalised: how much farther poses between frames are to stay apart
-    largest_change : of a vertex of a frame that is freed, normalised; None for any
-    kept_contacts : that are to be kept
+    continuous : whether poses between frames are also tested with interpolated vertices, not only
+        with interpolated codes
+    spare : >= 0, normalised, added to the clearance of poses between frames
+    largest_change : of a vertex of a resolved frame, normalised; None for no limit
+    kept_contacts : contacts to keep, or None
     """
 
     motion: Motion
@@ -82,38 +82,38 @@ class Frames:
         return self.motion.check(frame, self._check)
 
     def problem(self, frame: int) -> ResolveProblem:
-        """Return the problem of one frame, whose target is the frame as it was."""
+        """Return the problem of one frame, whose target is the original frame."""
         return self.resolver.problem(self.motion.codes[frame], self.options, self.job)
 
     @cached_property
     def metric(self) -> FloatArray:
-        """(D, D) what a change of the codes costs."""
+        """(D, D) the cost of a change of the codes."""
         return self.problem(0).metric
 
     @cached_property
     def inverse_metric(self) -> FloatArray:
-        """(D, D) its inverse; 0 in the rows and columns of locked codes."""
+        """(D, D) the inverse of `metric`; 0 in the rows and columns of locked codes."""
         movable = np.flatnonzero(self.problem(0).movable)
         inverse = np.zeros_like(self.metric)
         inverse[np.ix_(movable, movable)] = np.linalg.inv(self.metric[np.ix_(movable, movable)])
         return inverse
 
     def limits(self, frame: int) -> tuple[FloatArray, FloatArray]:
-        """Return the (D,) bounds of one frame's codes, which the frame as it was lies within."""
+        """Return the (D,) bounds of one frame's codes, which include the original frame."""
         problem = self.problem(frame)
         return problem.low, problem.high
 
     def distance(self, one: FloatArray, other: FloatArray) -> float:
-        """Return how far two (D,) poses are apart, the root of the metric's square."""
+        """Return the distance of two (D,) poses, the root of the metric's squared distance."""
         moved = one - other
         return math.sqrt(max(float(moved @ self.metric @ moved), 0.0))
 
     def contacts(self, frame: int, codes: FloatArray) -> HalfSpacesOfPose | None:
-        """Return what separates the contacts of (D,) codes at a frame; None if they are free."""
+        """Return half-spaces that separate the contacts of (D,) codes at a frame; None if free."""
         return self._separated(self.check(frame), codes)
 
     def pulls(self, frame: int, codes: FloatArray) -> Pulls | None:
-        """Return what brings together what is to touch in (D,) codes; None if nothing is."""
+        """Return the pulls of a frame's kept contacts at (D,) codes; None if it has none."""
         if self.kept_contacts is None or not self.kept_contacts.touches[frame]:
             return None
         self.job.check()
@@ -128,11 +128,11 @@ class Frames:
     def contacts_between(
         self, frame: int, share: float, start: FloatArray, end: FloatArray
     ) -> HalfSpacesOfPose | None:
-        """Return what separates the contacts of a pose between (D,) codes of a frame and the next.
+        """Return the half-spaces of `contacts` for a pose between two frames of (D,) codes.
 
         Parameters
         ----------
-        share : of the way, in (0, 1)
+        share : fraction of the way, in (0, 1)
         """
         codes = (1.0 - share) * start + share * end
         motion = self.motion
@@ -141,7 +141,7 @@ class Frames:
             contacts = self._separated(check, codes)
             if contacts is not None or not self.continuous:
                 return contacts
-        # Each frame lies where it was placed by itself: half-way is between their vertices.
+        # With placements, or if `continuous`, interpolate the vertices.
         ends = (motion.check(at, self._check_between) for at in (frame, frame + 1))
         meshes = (
             end_check.exported(end_check.decode(row)[0])
@@ -154,7 +154,7 @@ class Frames:
         return self._separated(replace(check, space=shaped), codes)
 
     def are_free(self, frames: range, job: Job = UNWATCHED) -> npt.NDArray[np.bool_]:
-        """Return which frames of the motion, as it was, are free."""
+        """Return which frames of the original motion are free."""
         motion, parts = self.motion, [np.empty(0, dtype=np.bool_)]
         placements, codes = motion.placements or (), motion.codes
         alike = motion.hidden is None and all(
@@ -177,10 +177,11 @@ class Frames:
     def collide_between(
         self, frames: npt.NDArray[np.intp], fractions: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return after which of (n,) frames of the motion, as it was, a pose between collides.
+        """Return (n,) whether a pose between a frame of the original motion and the next collides.
 
         Parameters
         ----------
+        frames : (n,)
         fractions : of the way to the next frame, of the poses between
         """
         codes = self.motion.codes
@@ -196,11 +197,12 @@ class Frames:
     def touch_between(
         self, frames: npt.NDArray[np.intp], codes: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return after which of (n,) frames something touches on the linear path of the vertices.
+        """Return (n,) whether something touches on the linear path from a frame to the next.
 
         Parameters
         ----------
-        codes : (T, D) of all frames, which are free there and in the next
+        frames : (n,), free like the next ones
+        codes : (T, D) of all frames
         """
 
         def touches(frame: int) -> bool:
@@ -217,11 +219,11 @@ class Frames:
         return np.fromiter(self.pool.map(touches, frames.tolist()), np.bool_, len(frames))
 
     def resolved(self, frame: int, correction: FloatArray | None = None) -> FloatArray | None:
-        """Return (D,) codes that are free near a frame, from a correction if there is one.
+        """Return free (D,) codes near a frame, starting from a correction if there is one.
 
         Returns
         -------
-        codes : (D,) as near to the frame as it was as they stay free; None if none are found
+        codes : (D,) pulled back towards the original frame; None if no free ones are found
         """
         check, problem, target = self.check(frame), self.problem(frame), self.motion.codes[frame]
         start = target if correction is None else target + correction
@@ -238,7 +240,7 @@ class Frames:
     def near(self, frame: int, codes: FloatArray) -> FloatArray | None:
         """Return the free codes nearest to (D,) codes at a frame, None if none are near enough."""
         check, resolver = self.check(frame), self.resolver
-        # A known free pose of the body may collide with a frame's own.
+        # A known free pose may collide with the body's shape in this frame.
         if len(check.hidden) or check.space is not resolver.check.space:
             resolver = resolver.with_check(check)
         result = resolver.resolve(
@@ -248,7 +250,7 @@ class Frames:
         return result.latent if is_kept else None
 
     def softened(self, frame: int) -> FloatArray:
-        """Return (D,) codes of less overlap within the largest change; a frame's own if none."""
+        """Return (D,) codes of less overlap within the largest change, else the original ones."""
         check, problem = self.check(frame), self.problem(frame)
         most = math.inf if self.largest_change is None else self.largest_change
         return LeastOverlap(check, problem, most).find(())
@@ -263,26 +265,26 @@ class Frames:
 
 
 _FLICKER = 10.0
-"""Price of the change of the correction from frame to frame against that of the correction."""
+"""Price of the correction's change from frame to frame, relative to that of the correction."""
 
 
 def chain_corrections(
     frames: Frames, run: range, before: FloatArray | None = None
 ) -> dict[int, FloatArray]:
-    """Resolve a run of colliding frames one after the other, forwards and backwards.
+    """Resolve a run of colliding frames in turn, forwards and backwards.
 
-    Each frame is polished from its target plus the correction of its neighbour, not from its
-    target, so that contacts keep to one side. The cheaper of the two directions counts.
+    Each frame is polished from its target plus the correction of its neighbour, so that contacts
+    stay on one side. The cheaper of the two directions is returned.
 
     Parameters
     ----------
     frames : of the motion
     run : colliding frames
-    before : (D,) correction of the frame before the run; None where that is free
+    before : (D,) correction of the frame before the run; None if that is free
 
     Returns
     -------
-    corrections : (D,) by frame, of those that could be freed
+    corrections : (D,) by frame, of the frames that were resolved
     """
     forwards, backwards = frames.pool.map(
         lambda order: _chained(frames, *order), ((run, before), (reversed(run), None))
@@ -316,16 +318,16 @@ def _cost(
 
 @dataclass(frozen=True)
 class FrameCollisions:
-    """What collides in one frame.
+    """The collisions of one frame.
 
     Attributes
     ----------
     frame : its number, from 0
     seconds : its time
-    n_pairs : pairs of faces that count
-    deepest : penetration depth of the deepest, or the most that a pair lacks of a clearance,
+    n_pairs : number of pairs of faces that count
+    deepest : penetration depth of the deepest pair, or the most that a pair lacks of a clearance,
         normalised
-    domains : pairs of domains, the first no larger than the second, with the most pairs first
+    domains : pairs of domains, the first no larger than the second, those with most pairs first
     """
 
     frame: int
@@ -337,14 +339,14 @@ class FrameCollisions:
 
 @dataclass(frozen=True)
 class FrameExclusions:
-    """What the contact rules leave out of one frame.
+    """The pairs that the contact rules exclude in one frame.
 
     Attributes
     ----------
     frame : its number, from 0
     seconds : its time
-    counts : pairs of faces by rule
-    deepest : penetration depth of the deepest, normalised
+    counts : numbers of pairs of faces by rule
+    deepest : penetration depth of the deepest pair, normalised
     """
 
     frame: int
@@ -360,14 +362,13 @@ class ScreenedMotion:
     Attributes
     ----------
     colliding : frames that collide, in order
-    in_between : numbers of frames that are free, and so is the next, with a pose between that is
-        not
-    collides_between : numbers of frames that are free, and so is the next, with contact on the
-        linear path of the vertices between; None where that was not asked for
-    least_distance, least_frame : where a clearance was asked for, the least signed distance of all
-        frames, and in which; None where nothing is as near as was looked for
-    left_out : what the contact rules leave out of the frames, where that was asked for
-    excluded : the same of each frame that was searched for it, in order
+    in_between : numbers of frames that are free like the next, but with a colliding pose between
+    collides_between : numbers of frames that are free like the next, but with contact on the linear
+        path of the vertices between; None if this was not checked
+    least_distance, least_frame : with a clearance, the least signed distance of all frames, and its
+        frame; None if no pair is within the search bound
+    left_out : summary of the pairs that the contact rules exclude, if these were looked for
+    excluded : the excluded pairs of each frame that was searched for them, in order
     """
 
     colliding: tuple[FrameCollisions, ...]
@@ -380,18 +381,18 @@ class ScreenedMotion:
 
     @property
     def deepest(self) -> float:
-        """Penetration depth of the deepest collision of all frames, normalised; 0 for none."""
+        """The largest depth of all frames, normalised; 0 without collisions."""
         return max((frame.deepest for frame in self.colliding), default=0.0)
 
 
 def colliding_domains(
     found: SelfCollisions, vertex_domain: npt.NDArray[np.intp], faces: npt.NDArray[np.int32]
 ) -> tuple[tuple[int, int], ...]:
-    """Return which domains collide: pairs, the first no larger than the second, the most first.
+    """Return pairs of colliding domains, the lower index first, those with most pairs first.
 
     Parameters
     ----------
-    found : of the mesh
+    found : collisions of the mesh
     vertex_domain, faces : see `screen_frames`
     """
     owners = np.sort(vertex_domain[faces[found.pairs][:, :, 0]], axis=1)
@@ -422,23 +423,23 @@ def screen_frames(
 
     Parameters
     ----------
-    mesh : (V, 3) vertices of a frame, or a share of the way from it to the next
+    mesh : returns (V, 3) vertices of a frame, or of a pose a share of the way to the next
     times : (T,) of the frames, in seconds
-    find : the exact check of vertices, and maybe of `counted_only`; safe between threads
+    find : the exact check of vertices, which takes `counted_only`; thread-safe
     vertex_domain : (V,) the part that each vertex belongs to
     faces : (F, 3) of the mesh
-    substeps : >= 0, poses between two free frames, evenly spaced
+    substeps : >= 0, number of evenly spaced poses between two free frames
     workers : threads, one for each available core by default
     job : reports (frames done, T); polled for each frame
-    measure : where a frame comes nearest to itself; safe between threads
-    touches : whether a free frame touches itself on the linear path to the next
-    estimated_free : (T,) frames that are taken to be free without a check; None for none
-    seen : the check of one frame, or of two and what is between, in place of `find`, `measure` and
-        `touches`, where frames hide faces
-    collide : which of some frames, or of poses a share of the way to the next, collide, quicker
-        than `find`; safe between threads
-    counted_only : whether not to look for what the contact rules leave out, else they are looked
-        for in every n-th frame: see `LeftOut.step_for`
+    measure : returns where vertices come nearest to each other; thread-safe
+    touches : returns whether a free frame touches itself on the linear path to the next
+    estimated_free : (T,) frames taken as free without a check; None for none
+    seen : returns the check of one frame, or of two and the poses between, which replaces `find`,
+        `measure` and `touches` if frames hide faces
+    collide : returns which of several frames, or of poses a share of the way to the next, collide,
+        faster than `find`; thread-safe
+    counted_only : whether to leave out the pairs that the contact rules exclude; if not, they are
+        looked for in every n-th frame: see `LeftOut.step_for`
 
     Raises
     ------
@@ -550,7 +551,7 @@ def screen_motion(
 
     Parameters
     ----------
-    continuous : whether the linear paths between frames are asked about
+    continuous : whether to check the linear paths between frames
     estimated_free, counted_only : see `screen_frames`
 
     Raises
@@ -581,7 +582,7 @@ def screen_motion(
 
 
 def contact_report(motion: Motion, check: ExactCheck) -> ContactReport | None:
-    """Return what a motion keeps of the contacts that it has to; None where these are not known."""
+    """Return how far a motion keeps its contacts; None if these are not known."""
     contacts = None if motion.contacts is None else motion.contacts()
     if contacts is None:
         return None
@@ -595,17 +596,17 @@ def contact_report(motion: Motion, check: ExactCheck) -> ContactReport | None:
 
 
 _LITTLE = 0.25
-"""Depth that joints take from a contact, at a mean displacement of the body of 1. A limb that moves
-alone takes several times as much as the whole body moves on average; where it is less than this,
-what overlaps goes along."""
+"""Depth that joints remove from a contact, per mean displacement of the body. A limb that moves
+alone removes several times the body's mean displacement; if it is less than this, the overlapping
+parts move together."""
 
 
 _ROUNDED = 1.0 + 1e-4
-"""Of the largest change: files hold single precision."""
+"""Factor of the largest change that allows for single precision in files."""
 
 
 class Reason(StrEnum):
-    """Why frames were not freed."""
+    """Why frames were not resolved."""
 
     NO_JOINT = "no joint moves them apart"
     TOO_FAR = "what frees them moves a vertex farther than the largest change"
@@ -617,17 +618,17 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True)
 class KeptSpan:
-    """Successive frames of a motion that its resolution did not free.
+    """Successive frames of a motion that were not resolved.
 
     Attributes
     ----------
-    frames : the first and the last of them; in a cycle the last may come before the first
-    reason : why
-    parts : pairs of domains that overlap in the deepest frame, as they are now, the most pairs
-        first; none where that was not looked at
-    deepest : depth of their deepest overlap now, normalised
-    is_original : whether they are equal to the bit to what they were; else they have the least
-        overlap that was found
+    frames : the first and the last frame; in a cycle the last may come before the first
+    reason : why they were not resolved
+    parts : pairs of domains that overlap in the deepest frame of the result, those with most pairs
+        first; empty if this was not checked
+    deepest : depth of the deepest overlap in the result, normalised
+    is_original : whether the frames are unchanged to the bit; else they have the least overlap that
+        was found
     """
 
     frames: tuple[int, int]
@@ -637,7 +638,7 @@ class KeptSpan:
     is_original: bool = True
 
     def to_json(self, part_names: Sequence[str]) -> dict[str, object]:
-        """Return what reports hold of it, body parts by their names."""
+        """Return the values for reports, with body parts by name."""
         return {
             "frames": list(self.frames),
             "reason": str(self.reason),
@@ -648,7 +649,7 @@ class KeptSpan:
         }
 
     def sentence(self, part_names: Sequence[str]) -> str:
-        """Say which frames, what overlaps in them, and why."""
+        """Return a sentence on the frames, the overlapping parts and the reason."""
         first, last = self.frames
         frames = f"frame {first}" if first == last else f"frames {first} to {last}"
         verb = "stays as it was" if first == last else "stay as they were"
@@ -663,15 +664,14 @@ class KeptSpan:
 
 @dataclass(frozen=True, eq=False)
 class Guard:
-    """Judges the corrected frames of a motion by the motion as it was.
+    """Judge the corrected frames of a motion against the original motion.
 
     Attributes
     ----------
-    frames : of the motion, a cycle gone through twice
-    n : how many of them there are
+    frames : of the motion, two turns of a cycle
+    n : number of frames, of one turn
     was_free : (n,) bool
-    was_clear : (n,) bool, frames that were free, and so was the next, with no pose between that
-        collides
+    was_clear : (n,) bool, whether a frame and the next were free, and all poses between
     """
 
     frames: Frames
@@ -686,13 +686,13 @@ class Guard:
         free: npt.NDArray[np.bool_],
         fractions: Sequence[FloatArray],
     ) -> dict[int, Reason]:
-        """Return the frames of a span that are worse than they were, and why.
+        """Return the frames of a span that are worse than the original, and why.
 
         Parameters
         ----------
         codes : (n, D) corrected
-        free : (n,) bool, which is set for the frames of the span
-        fractions : of each frame, of the way to the next, of poses that are looked at
+        free : (n,) bool, set for the frames of the span
+        fractions : for each frame, fractions of the way to the next of the poses to check
         """
         own = [at % self.n for at in span]
         reasons: dict[int, Reason] = {}
@@ -738,13 +738,13 @@ class Guard:
         return check.find(check.exported(check.decode(codes)[0]))
 
     def kept(self, run: range, codes: FloatArray, reasons: Mapping[int, Reason]) -> KeptSpan | None:
-        """Describe a run of frames that collide, or did; None where it is free and was changed.
+        """Describe a run of frames that collide, or did; None if it is free and was changed.
 
         Parameters
         ----------
         run : frames
-        codes : (n, D) as they are now
-        reasons : by frame, where one is known
+        codes : (n, D) of the result
+        reasons : known reasons, by frame
         """
         own = [at % self.n for at in run]
         was = self.frames.motion.codes
@@ -762,7 +762,7 @@ class Guard:
         return KeptSpan((own[0], own[-1]), reason, parts, overlap.deepest, is_original)
 
     def _is_carried(self, at: int, codes: FloatArray) -> bool:
-        """Whether the deepest contact of a pose hardly opens however the joints turn."""
+        """Whether no motion of the joints opens the deepest contact of a pose much."""
         contacts = self.frames.contacts(at, codes)
         if contacts is None:
             return False
@@ -777,13 +777,13 @@ def is_worse(
     new: npt.NDArray[np.floating],
     largest_change: float | None,
 ) -> bool:
-    """Whether a vertex of a frame moves too far, or more overlaps, or anything deeper.
+    """Whether a vertex of a frame moves too far, or there are more or deeper collisions.
 
     Parameters
     ----------
     check : of the frame
-    old, new : (V, 3) vertices where they are exported to
-    largest_change : of a vertex, normalised; None for any
+    old, new : (V, 3) exported vertices
+    largest_change : of a vertex, normalised; None for no limit
     """
     if largest_change is not None:
         size = check.body_size * (1.0 if check.placement is None else check.placement.scale)
@@ -800,12 +800,12 @@ def worse_spans(
     check: ExactCheck,
     largest_change: float | None,
 ) -> list[range]:
-    """Return the spans of a motion of which a frame is worse than it was.
+    """Return the spans in which a frame of a motion is worse than the original.
 
     Parameters
     ----------
-    before, after : of as many frames
-    spans : that are looked at
+    before, after : motions with the same number of frames
+    spans : to check
     check : of the body's poses
     largest_change : see `is_worse`
     """

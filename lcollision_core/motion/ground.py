@@ -1,4 +1,4 @@
-"""How a motion stands on a level ground: what sinks into it, floats, or slides."""
+"""Measure how parts of a motion sink into a level ground, float above it or slide on it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lcollision_core.motion.motion import Motion, placed_frames, standing_parts
 from lcollision_core.posing import ExactCheck
 
 _SOLE = 0.005
-"""Normalised: what is no higher above the lowest vertex of a part is what it stands on."""
+"""Normalised height above a part's lowest vertex up to which vertices belong to its sole."""
 
 
 @dataclass(frozen=True)
@@ -21,10 +21,10 @@ class GroundReport:
 
     Attributes
     ----------
-    standing_frames : in which a body part stands: near the ground, it hardly moves
-    sink, sink_frame : how far the lowest point of all frames is below the ground, 0 for none
-    gap, gap_frame : how far the lowest point of a part that stands is above it, at most
-    slide, slide_frame : how far a part is along the ground from where it came to stand, at most
+    standing_frames : number of frames in which a body part stands: near the ground, hardly moving
+    sink, sink_frame : largest depth of a point below the ground, 0 for none, and its frame
+    gap, gap_frame : largest height of the lowest point of a standing part above the ground
+    slide, slide_frame : largest distance of a part along the ground from where it came to stand
     """
 
     standing_frames: int = 0
@@ -49,14 +49,14 @@ class GroundReport:
         Parameters
         ----------
         up : (3,) unit vector
-        ground : its height along that, normalised
-        stands : (V,) which vertices are not the ground's own
+        ground : its height along `up`, normalised
+        stands : (V,) whether a vertex does not belong to the ground itself
         """
         domain = np.where(stands, check.space.vertex_domain, -1)
         standing, axis = standing_parts(motion, check, up, ground), np.asarray(up, np.float64)
         level = np.eye(3) - np.outer(axis, axis)
         worst = dict.fromkeys(("sink", "gap", "slide"), (0.0, 0))
-        # Of each part that stands, the vertices that came to stand, and where their middle was.
+        # For each standing part, the vertices of its sole and where their mean was at first.
         held: dict[int, tuple[npt.NDArray[np.intp], FloatArray]] = {}
         n_standing = 0
         for frame, vertices in enumerate(placed_frames(motion, check)):

@@ -1,4 +1,4 @@
-"""A motion: frames, corrections, spans that change, and what is reported of them."""
+"""A motion: frames, corrections, spans that change, and reports of them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lcollision_core.motion.contacts import KeptContacts
 from lcollision_core.posing import ExactCheck, PoseSpace
 
 NOMINAL_RATE = 30.0
-"""Frames a second that lengths of time in frames refer to."""
+"""Frame rate to which durations in frames refer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,18 +26,17 @@ class Motion:
 
     Attributes
     ----------
-    name : of the motion, as of its clip
+    name : of the motion, such as that of its clip
     times : (T,) float64 array, in seconds, ascending
     codes : (T, D) float64 array, read-only
-    placements : where each frame's pose lies; None leaves all of them where they are decoded
-    space_at : at a time, counted in frames from 0, the poses of the body as it is then, of which
-        the codes are one: as a clip scales its joints or weighs morph targets. None where all
-        frames are poses of the body itself.
+    placements : placement of each frame's pose; None leaves all as decoded
+    space_at : returns the pose space of the body at a time, counted in frames from 0, if the body
+        changes, as a clip scales its joints or weights morph targets; None if it does not
     source : the name of the file that it was read from, "" if there is none
-    hidden : of a frame, the numbers of the faces that count in none of its pairs, as it scales them
-        to nothing; None where no frame does
-    contacts : what touches on the body that the motion was made for, as patches of this one; None
-        where that is this one or has no surface
+    hidden : returns the faces that a frame scales to nothing, which count in none of its pairs;
+        None if no frame does
+    contacts : returns the contacts of the body that the motion was made for, as patches of this
+        body; None if that is this body or has no surface
 
     Raises
     ------
@@ -75,7 +74,7 @@ class Motion:
             )
         if not (np.isfinite(self.times).all() and (np.diff(self.times) > 0.0).all()):
             raise ShapeError(f"the times of the motion {self.name!r} do not ascend", "sort them")
-        # A view, so that the caller's array stays writable.
+        # Take a view, so that the caller's array stays writable.
         view = self.codes.view()
         view.flags.writeable = False
         object.__setattr__(self, "codes", view)
@@ -86,12 +85,12 @@ class Motion:
 
     @cached_property
     def rate(self) -> float:
-        """Frames a second, the median; the nominal rate of a single frame."""
+        """The median frame rate, in frames a second; the nominal rate for a single frame."""
         return 1.0 / float(np.median(np.diff(self.times))) if len(self) > 1 else NOMINAL_RATE
 
     @cached_property
     def is_cycle(self) -> bool:
-        """Whether the last frame is the first again, to the bit."""
+        """Whether the last frame repeats the first one, to the bit."""
         if len(self) == 1 or not np.array_equal(self.codes[0], self.codes[-1]):
             return False
         first, last = (
@@ -104,7 +103,7 @@ class Motion:
         return np.array_equal(begin, end)
 
     def two_turns(self) -> Motion:
-        """Return a cycle gone through twice, without the frame that is its first again."""
+        """Return two turns of a cycle, without the frame that repeats the first."""
         n, own, hidden = len(self) - 1, self.space_at, self.hidden
         turn = self.times[:-1]
         return replace(
@@ -118,7 +117,7 @@ class Motion:
         )
 
     def _contacts_at(self, frames: Sequence[int]) -> Callable[[], KeptContacts | None] | None:
-        """Return the contacts of a motion of some of the frames."""
+        """Return the `contacts` of a motion of some of the frames."""
         own = self.contacts
         if own is None:
             return None
@@ -130,15 +129,15 @@ class Motion:
         return chosen
 
     def placement(self, frame: int) -> RigidTransform | None:
-        """Return where one frame's pose lies."""
+        """Return the placement of one frame's pose."""
         return None if self.placements is None else self.placements[frame]
 
     def in_frames(self, nominal: float) -> int:
-        """Return how many frames last as long as so many at the nominal rate; at least 1."""
+        """Return the number of frames, at least 1, as long as `nominal` at `NOMINAL_RATE`."""
         return max(1, round(nominal * self.rate / NOMINAL_RATE))
 
     def part(self, frames: range) -> Motion:
-        """Return some successive frames alone, at their times."""
+        """Return the motion of some successive frames, at their times."""
         own, hidden = self.space_at, self.hidden
         chosen = slice(frames.start, frames.stop)
         return replace(
@@ -152,11 +151,11 @@ class Motion:
         )
 
     def at_rate(self, rate: float) -> Motion:
-        """Return the motion at so many frames a second, its codes linear between its own frames.
+        """Return the motion at `rate` frames a second, with linearly interpolated codes.
 
-        Where each frame is placed by itself, the nearest is taken.
+        With placements, the nearest frames are taken instead.
         """
-        # A rounding error is no frame less.
+        # A rounding error must not lose a frame.
         n = int((self.times[-1] - self.times[0]) * rate + 1e-3) + 1
         times = np.minimum(self.times[0] + np.arange(n) / rate, self.times[-1])
         if len(self) == n and np.allclose(times, self.times, rtol=0.0, atol=1e-6):
@@ -180,40 +179,40 @@ class Motion:
         )
 
     def space(self, time: float, space: PoseSpace) -> PoseSpace:
-        """Return the poses of a body as it is at a time, counted in frames; its own in all else."""
+        """Return the pose space of the body at a time, counted in frames; `space` by default."""
         return space if self.space_at is None else self.space_at(time)
 
     def check(self, frame: int, check: ExactCheck, share: float = 0.0) -> ExactCheck:
-        """Return the exact check of one frame: where it lies, and of the body as it is then.
+        """Return the exact check of one frame, with its placement and the body's shape then.
 
         Parameters
         ----------
-        share : of the way to the next frame
+        share : fraction of the way to the next frame
         """
         space = self.space(frame + share, check.space)
         own = replace(check, space=space, placement=self.placement(frame))
         return self.seen(own, range(frame, frame + 1 + (share > 0.0)))
 
     def seen(self, check: ExactCheck, frames: range) -> ExactCheck:
-        """Return a check without the faces that some of the frames hide."""
+        """Return a check without the faces that any of the frames hides."""
         if self.hidden is None:
             return check
         return replace(check, hidden=np.unique(np.concatenate([*map(self.hidden, frames)])))
 
     def drawn(self, frame: int, check: ExactCheck) -> npt.NDArray[np.float32]:
-        """Return the (V, 3) vertices of a frame as they are drawn, in the model's frame."""
+        """Return the (V, 3) vertices of a frame as they are drawn, in model coordinates."""
         own = self.check(frame, check)
         return own.drawn(own.decode(self.codes[frame])[0])
 
     def vertices(
         self, frame: int, check: ExactCheck, share: float = 0.0
     ) -> npt.NDArray[np.floating]:
-        """Return the (V, 3) vertices of a frame, or between it and the next, as they are exported.
+        """Return the exported (V, 3) vertices of a frame, or of a pose between it and the next.
 
         Parameters
         ----------
-        share : of the way to the next frame. Where each frame is placed by itself, that is between
-            the vertices of both, else between the codes.
+        share : fraction of the way to the next frame. With placements, poses between interpolate
+            the vertices of both frames, else the codes.
         """
         codes = self.codes[frame]
         if share and self.placements is None:
@@ -228,15 +227,15 @@ class Motion:
     def collide(
         self, frames: Sequence[int], check: ExactCheck, share: float = 0.0
     ) -> npt.NDArray[np.bool_]:
-        """Tell which of n frames, or poses between them and the next, collide: (n,) bool.
+        """Return (n,) whether each frame, or a pose between it and the next, collides.
 
-        All in a few calls that no interpreter holds up, where frames hide nothing.
+        It takes only a few calls of compiled loops; frames must hide nothing.
 
         Parameters
         ----------
         frames : their numbers
         check : of their vertices
-        share : as of `vertices`
+        share : as for `vertices`
         """
         if self.space_at is not None or (share and self.placements is not None):
             meshes = np.stack([self.vertices(frame, check, share) for frame in frames])
@@ -255,21 +254,20 @@ class Motion:
 
 
 def corrected(motion: Motion, frame: int, codes: npt.ArrayLike, easing: int) -> Motion:
-    """Set one frame of a motion, and lead the frames round it there and back.
+    """Set one frame of a motion, and ease the change in and out over the frames around it.
 
-    A motion whose first and last frame are equal, as a cycle's, is eased across its seam and stays
-    one.
+    A cycle, whose first and last frames are equal, is eased across its seam and stays one.
 
     Parameters
     ----------
     motion : T frames
-    frame : that is set
-    codes : (D,) what it is set to
+    frame : the frame to set
+    codes : (D,) its new codes
     easing : >= 0, frames on either side over which the change fades, on a raised cosine
 
     Returns
     -------
-    corrected : all frames beyond those stay equal to the bit
+    corrected : the motion; frames beyond the easing stay equal to the bit
 
     Raises
     ------
@@ -285,17 +283,17 @@ def corrected(motion: Motion, frame: int, codes: npt.ArrayLike, easing: int) -> 
     change = aim - motion.codes[frame]
     for at, away in reached.items():
         changed[at] += (0.5 + 0.5 * np.cos(np.pi * away / (easing + 1))) * change
-    # What was set is there to the bit.
+    # Set the frame's own codes to the bit.
     changed[[at for at, away in reached.items() if away == 0]] = aim
     return replace(motion, codes=changed)
 
 
 def eased_frames(motion: Motion, frame: int, easing: int) -> dict[int, int]:
-    """Return the frames that a correction of one reaches, and how far each is from it."""
+    """Return the frames that the correction of one frame reaches, with their distances from it."""
     n = len(motion)
     near = {at: abs(at - frame) for at in range(max(0, frame - easing), min(n, frame + easing + 1))}
     if motion.is_cycle:
-        # The last frame is the first of the next cycle.
+        # The last frame is the first one of the next cycle.
         for at in range(n):
             away = min(abs(at - frame + cycle * (n - 1)) for cycle in (-1, 1))
             if away <= easing:
@@ -318,16 +316,16 @@ def colliding_spans(
 ) -> list[range]:
     """Return the spans of frames that may change: colliding ones, and `easing` on either side.
 
-    Spans that would overlap or meet are one, and none goes beyond the frames `within`.
+    Spans that would overlap or meet are joined, and none goes beyond the frames `within`.
 
     Parameters
     ----------
     colliding : (T,) mask
-    easing : frames
+    easing : number of frames
     within : the frames that may change; all if None
-    is_cycle : the first frame comes after the last, and its number is T there: a span across the
-        seam goes on beyond it, and one of all frames begins where it is free, if there is such
-    barred : (T,) mask, frames that may not change and are left aside though they collide
+    is_cycle : whether the first frame follows the last, with number T: a span across the seam then
+        continues beyond T, and a span of all frames begins at a free one, if there is any
+    barred : (T,) mask of frames that may not change, even if they collide
     """
     n = len(colliding)
     if barred is not None:
@@ -346,27 +344,27 @@ def colliding_spans(
     spans = [range(first + run.start, first + run.stop) for run in runs(np.roll(eased, -first))]
     if barred is None:
         return spans
-    # Nothing fades over frames behind those that are barred.
+    # Drop spans that barred frames separate from the collision they would ease.
     return [span for span in spans if colliding[np.asarray(span) % n].any()]
 
 
 def windows(span: range, length: int, overlap: int) -> list[range]:
-    """Cut a long span into windows that are resolved one after the other.
+    """Divide a long span into windows to resolve in turn.
 
-    Each begins `overlap` frames before the end of the one before, which it corrects again.
+    Each begins `overlap` frames before the end of the previous one, and corrects these again.
     """
     starts = range(span.start, max(span.start + 1, span.stop - overlap), length - overlap)
     return [range(start, min(start + length, span.stop)) for start in starts]
 
 
 NEAR_GROUND = 0.03
-"""Normalised: what stands is no higher above the lowest point of the motion."""
+"""Normalised height above the motion's lowest point up to which parts may stand."""
 
 STILL = 0.03
-"""Normalised lengths a second: what stands moves no faster."""
+"""Speed up to which a part stands, in normalised lengths a second."""
 
 _AT_ONCE = 64
-"""Frames that are decoded together."""
+"""Number of frames that are decoded together."""
 
 
 def standing_parts(
@@ -374,19 +372,19 @@ def standing_parts(
 ) -> npt.NDArray[np.bool_]:
     """Find the body parts that rest near the ground.
 
-    A part stands in a frame where its vertices near the ground hardly move to the frame before or
-    after.
+    A part stands in a frame if its vertices near the ground hardly move from the previous frame or
+    to the next.
 
     Parameters
     ----------
     motion : of T frames
     check : decodes poses
     up : (3,) unit vector
-    ground : its height along that, normalised; that of the lowest point of the motion if None
+    ground : its height along `up`, normalised; that of the motion's lowest point if None
 
     Returns
     -------
-    standing : (T, K) bool, which of the K body parts stand in each frame
+    standing : (T, K) bool, whether each of the K body parts stands in each frame
     """
     domain, n_domains = check.space.vertex_domain, check.space.n_domains
     axis = np.asarray(up, dtype=np.float64)
@@ -406,14 +404,14 @@ def standing_parts(
 
 
 def parts_on_ground(motion: Motion, check: ExactCheck, up: npt.ArrayLike) -> frozenset[int]:
-    """Return the body parts that are near the lowest point of a motion's first frame."""
+    """Return the body parts as low as the lowest point of a motion's first frame."""
     heights = next(placed_frames(motion, check)) @ np.asarray(up, dtype=np.float64)
     low = heights < heights.min() + NEAR_GROUND
     return frozenset(check.space.vertex_domain[low].tolist())
 
 
 def placed_frames(motion: Motion, check: ExactCheck) -> Iterator[FloatArray]:
-    """Decode a motion's frames one after the other: (V, 3) normalised, where each is placed."""
+    """Yield the normalised (V, 3) vertices of a motion's frames in turn, as placed."""
     n_at_once = _AT_ONCE if motion.space_at is None else 1
     for start in range(0, len(motion), n_at_once):
         decoding = motion.space(start, check.space)
@@ -426,23 +424,22 @@ def placed_frames(motion: Motion, check: ExactCheck) -> Iterator[FloatArray]:
 
 
 _STILL = 1e-9
-"""Normalised: a frame none of whose vertices has moved farther is unchanged."""
+"""Normalised displacement of a vertex up to which a frame counts as unchanged."""
 
 
 @dataclass(frozen=True)
 class MotionReport:
-    """What a resolution did to a motion. Lengths are normalised.
+    """The change of a motion by Resolve. Lengths are normalised.
 
     Attributes
     ----------
-    mean_change : over the vertices of the frames that changed
-    largest_change : of any vertex
+    mean_change : mean displacement over the vertices of the frames that changed
+    largest_change : largest displacement of a vertex
     acceleration_ratio : mean squared second difference of the vertices after, over that before, in
-        the frames that changed and those beside them; 1 where none did
-    largest_jump : of the change of the correction from one frame to the next, the mean over the
+        the frames that changed and their neighbours; 1 if none changed
+    largest_jump : largest change of the correction from one frame to the next, as a mean over the
         vertices
-    foot_slide : the farthest that the mean of a standing part's change moves from one frame to the
-        next
+    foot_slide : largest change of a standing part's mean displacement from one frame to the next
     """
 
     mean_change: float = 0.0
@@ -459,13 +456,13 @@ class MotionReport:
         check: ExactCheck,
         standing: npt.NDArray[np.bool_] | None = None,
     ) -> MotionReport:
-        """Measure a motion against itself as it was, frame by frame in bounded memory.
+        """Compare a motion with the original, frame by frame in bounded memory.
 
         Parameters
         ----------
         before, after : T frames each, at the same times
         check : of the body's poses
-        standing : (T, K) bool, the parts that stood in each frame
+        standing : (T, K) bool, whether each part stands in each frame
         """
         domain, n_domains = check.space.vertex_domain, check.space.n_domains
         sizes = np.maximum(np.bincount(domain, minlength=n_domains), 1)

@@ -1,4 +1,4 @@
-"""Resolve a motion: colliding spans free and as smooth as they were, all else unchanged."""
+"""Resolve a motion: free its colliding spans smoothly, and leave all else unchanged."""
 
 from __future__ import annotations
 
@@ -30,35 +30,34 @@ from lcollision_core.resolve import PoseResolver
 from lcollision_core.resolve.problem import single_torch_thread
 
 WINDOW, OVERLAP = 120, 24
-"""Frames at 30 a second that are resolved together at most, and how many of them a second time in
-the next window: the program's cost grows with the square of the frames."""
+"""Most frames, at 30 a second, that are resolved together, and the number of these that the next
+window resolves again: the program's cost grows with the square of the frames."""
 
 _SOFT_ROUNDS = 6
-"""How often corrections that take overlap away are made smooth, without the frames that are worse
-with them than they were."""
+"""Most rounds of smoothing corrections that remove overlap, each without the frames that became
+worse."""
 
 _SPARE, _MOST_BETWEEN = (0.0, 0.0, 0.002, 0.004, 0.008), 7
-"""Of each time that a span is solved because something touches between its frames: how much farther
-poses between frames are to stay apart, normalised; and up to how many of them are looked at."""
+"""Normalised distance added between parts in poses between frames, for each round of solving spans
+that touch there, and the most such poses per frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class ResolvedMotion:
-    """Where the resolution of a motion ended.
+    """The result of resolving a motion.
 
     Attributes
     ----------
-    motion : the frames, those outside `spans` unchanged to the bit
-    before, after : (T,) bool, which frames were free, and are, by the exact check; True of frames
-        that were not looked at
+    motion : the frames; those outside `spans` are unchanged to the bit
+    before, after : (T,) bool, whether each frame was and is free by the exact check; True for
+        frames that were not checked
     spans : of frames that may have changed
     standing : (T, K) bool, the body parts that were kept on the ground in each frame
-    touching : numbers of frames that may have changed and are free, and so is the next, with
-        contact on the linear path of the vertices between; None where that was not asked for
-    unfinished : spans, or the ends of some, that were not done when the work was stopped, and are
-        as they were
-    kept : what was not freed, and why
-    ground : how it stands on the ground of its scene; None where that was not looked at
+    touching : numbers of frames in `spans` that are free like the next, but with contact on the
+        linear path of the vertices between; None if this was not checked
+    unfinished : spans, or ends of spans, that a stop has left unchanged
+    kept : frames that were not resolved, and why
+    ground : how the motion stands on the ground of its scene; None if this was not measured
     """
 
     motion: Motion
@@ -73,7 +72,7 @@ class ResolvedMotion:
 
 
 Solved = tuple[FloatArray, bool]
-"""The (D,) codes of a frame, and whether it is free with them."""
+"""The (D,) codes of a frame, and whether they are free."""
 
 
 def resolve_motion(
@@ -92,40 +91,39 @@ def resolve_motion(
 ) -> ResolvedMotion:
     """Resolve the self-collisions of a motion.
 
-    Each colliding span, of frames that collide or have a pose between them that does, with frames
-    on both sides over which its correction fades, is one program: of all corrections that keep its
-    frames free, and the poses between them, the ones that are smallest and change the motion's
+    Each span of frames that collide, or have a colliding pose between them, with frames on both
+    sides over which its correction fades, is one program. Of all corrections that keep its frames
+    and the poses between them free, it finds those that are smallest and change the motion's
     acceleration least. Long spans are resolved window by window, so that memory does not grow with
-    the motion. A cycle, whose last frame is the first again, stays one: spans go on across its
+    the motion. A cycle, whose last frame repeats the first, stays one: spans continue across its
     seam. With `continuous` in the options, spans in which something touches on the linear path of
     the vertices between two frames are solved again with more poses there, until nothing does.
 
-    No frame comes out with more pairs or deeper ones than it had, none that was free collides, and
-    no vertex is moved farther than the largest change. Frames that could only be freed by that are
-    left out, and what is around them is resolved without them. They then get the least overlap that
-    is found within these limits, or stay as they were to the bit.
+    No frame gets more pairs or deeper ones than it had, no free frame collides, and no vertex moves
+    farther than the largest change. Frames that cannot be resolved within these limits are left
+    out, and the frames around them are resolved without them. They then get the least overlap found
+    within the limits, or stay unchanged to the bit.
 
     Parameters
     ----------
     resolver : of the body's poses
     motion : T frames
-    up : (3,) unit vector, for what stands on the ground
+    up : (3,) unit vector, to find parts that stand on the ground
     options : the defaults if None
     workers : threads, one for each available core by default; results do not depend on it
-    job : reports (frames of colliding spans done, all of them), first with 0, and while spans are
-        computed; there are more in all once some are computed again; polled for each frame
-    within : the frames that may change and are looked at; all if None
-    done : frames of an earlier run; windows of which all frames are there are not computed again
-    keep : called with each frame of a further window as soon as that is done, from one thread at a
-        time
-    stop : ends the work early, polled as `job`: spans that are done are the result, with the
-        windows of long ones that are; the others stay as they were
-    checking : called with (frames checked, all that are to be) before there are spans
+    job : reports (frames of colliding spans done, all of them), first with 0 done; the total grows
+        when spans are computed again; polled for each frame
+    within : the frames that are checked and may change; all if None
+    done : frames of an earlier run; windows whose frames are all done are not computed again
+    keep : called with each frame of a new window once that is done, from one thread at a time
+    stop : ends the work early, polled like `job`: finished spans, and finished windows of long
+        ones, are the result; the others stay unchanged
+    checking : called with (frames checked, frames to check) before spans are known
 
     Returns
     -------
-    result : ResolvedMotion; a frame that cannot be freed is not free in `after`, and the others
-        are as if it were
+    result : ResolvedMotion; a frame that cannot be resolved is False in `after`, and does not
+        affect the others
 
     Raises
     ------
@@ -159,25 +157,25 @@ def resolve_motion(
 
 @dataclass(eq=False)
 class _Resolution:
-    """The resolution of a motion while it goes on; frame t of a cycle is frame t modulo n.
+    """The state of resolving a motion; frame t of a cycle is frame t modulo n.
 
     Attributes
     ----------
     motion, frames, options, within : of the motion
-    is_cycle, n : whether it is one, and its frames without that which is the first again
-    before : (T,) which frames were free
-    colliding : (n,) frames that collide, or have a pose beside them that does
-    apart : (n,) frames in which something that is to touch does not
-    guard : judges what was solved
+    is_cycle, n : whether it is a cycle, and its number of frames without the repeated one
+    before : (T,) whether each frame was free
+    colliding : (n,) frames that collide, or are next to a colliding pose between frames
+    apart : (n,) frames in which patches that should touch do not
+    guard : judges the solved frames
     standing : (T, K)
-    substeps : (n,) poses that are looked at after each frame
-    codes, after : (n, D) and (n,), as they are by now
-    is_changed : (n,) frames of spans that are solved
-    barred : (n,) frames that stay as they were, unless some overlap can be taken from them
+    substeps : (n,) number of poses that are checked after each frame
+    codes, after : (n, D) and (n,), the current codes and whether they are free
+    is_changed : (n,) frames of solved spans
+    barred : (n,) frames that stay unchanged, unless some overlap can be removed
     reasons : why frames are barred
-    unfinished : spans, or the ends of some, that were stopped
-    solved : of a span, how many of its frames are in windows that are done
-    n_frames, n_done : frames of spans, and how many of them are done
+    unfinished : spans, or ends of spans, that were stopped
+    solved : for a span, the number of its frames in finished windows
+    n_frames, n_done : number of frames of spans, and of those that are done
     """
 
     motion: Motion
@@ -218,7 +216,7 @@ class _Resolution:
         up: npt.ArrayLike,
         checking: Job,
     ) -> _Resolution:
-        """Check the motion as it is."""
+        """Check the original motion, and return the initial state."""
         is_cycle = motion.is_cycle
         n = len(motion) - 1 if is_cycle else len(motion)
         before = np.ones(len(motion), dtype=np.bool_)
@@ -260,8 +258,8 @@ class _Resolution:
         return self
 
     def result(self) -> ResolvedMotion:
-        """Solve all spans, until none is worse than it was."""
-        # What is done is judged after a stop too.
+        """Solve all spans, until none is worse than the original."""
+        # Finished frames are judged after a stop too.
         self.guard = replace(self.guard, frames=replace(self.frames, job=self.job.part()))
         again = np.arange(len(self.motion)) % self.n
         todo, touching = self._spans(), np.empty(0, dtype=np.intp)
@@ -317,14 +315,14 @@ class _Resolution:
 
     @property
     def _wanted(self) -> npt.NDArray[np.bool_]:
-        """(n,) frames that are to change."""
+        """(n,) frames that should change."""
         return self.colliding | self.apart
 
     def _spans(self) -> list[range]:
         return colliding_spans(self._wanted, self._easing, self.within, self.is_cycle, self.barred)
 
     def _own(self, span: range) -> npt.NDArray[np.intp]:
-        """Return the numbers of a span's frames, each below n."""
+        """Return the indices of a span's frames, modulo n."""
         return np.asarray(span) % self.n
 
     def _put_back(self, span: range) -> None:
@@ -333,7 +331,7 @@ class _Resolution:
         self.is_changed[own] = False
 
     def _solve_all(self, spans: Sequence[range], spare: float) -> None:
-        """Solve spans, at the same time; of one that is stopped, keep what is done."""
+        """Solve spans in parallel; keep the finished part of a span that is stopped."""
         self.n_frames += sum(map(len, spans))
         frames = replace(self.frames, spare=spare)
         tasks = [(span, self.outer.submit(self._solve, frames, span)) for span in spans]
@@ -348,10 +346,10 @@ class _Resolution:
                 self.unfinished.append(rest)
 
     def _without_finished(self, span: range) -> range:
-        """Keep the beginning of a stopped span that is done; return the rest, which is put back.
+        """Keep the finished beginning of a stopped span; return the rest, which is put back.
 
-        It ends with frames that were free, over which the correction of the last that collided
-        fades, if nothing is worse by that than it was.
+        The beginning ends with free frames over which the correction fades, if that makes nothing
+        worse.
         """
         own, n_solved = self._own(span), self.solved.pop(span, 0)
         targets, solutions = self.motion.codes[own], self.codes[own]
@@ -390,7 +388,7 @@ class _Resolution:
         for window in windows(span, self.motion.in_frames(WINDOW), self.motion.in_frames(OVERLAP)):
             known = [self.done[at] for at in self._own(window).tolist() if at in self.done]
             is_new = len(known) < len(window)
-            # What the next window corrects again counts once.
+            # Frames that the next window corrects again count once.
             credit = _Credit(self, window.stop - reached)
             if is_new:
                 known = self._solve_window(frames, window, span, credit.tell)
@@ -406,17 +404,17 @@ class _Resolution:
     def _solve_window(
         self, frames: Frames, window: range, span: range, tell: Callable[[float], None]
     ) -> list[Solved]:
-        """Resolve some frames of a span, those before them being done."""
+        """Resolve a window of a span, whose earlier windows are done."""
         motion, n, codes = frames.motion, self.n, self.codes
         is_round = self.is_cycle and len(span) == n
 
         def corrections(first: int) -> FloatArray:
-            """Return those of two frames: done ones of the span, beyond its ends none."""
+            """Return the corrections of two frames: 0 beyond the ends of the span."""
             two = np.arange(first, first + 2)
             inside = [is_round or at in span for at in two.tolist()]
             return np.where(np.array(inside)[:, None], codes[two % n] - motion.codes[two % n], 0.0)
 
-        # Beyond the ends of a span, and of what of it is done, the corrections are known.
+        # The corrections beyond the ends of the span, and of its finished windows, are known.
         begins, ends = window.start == span.start, window.stop == span.stop
         is_open = begins if is_round else not self.is_cycle and window.start == 0
         before = None if is_open else corrections(window.start - 2)
@@ -450,11 +448,11 @@ class _Resolution:
         self.reasons |= dict.fromkeys(frames.tolist(), reason)
 
     def _bar_faults(self, spans: Sequence[range]) -> list[range]:
-        """Put spans back that are worse than they were, and leave out what made them so.
+        """Put back spans that are worse than the original, and bar the frames that made them so.
 
         Returns
         -------
-        spans : what is left of them, to be solved again
+        spans : the rest of them, to be solved again
         """
         is_open = np.zeros(self.n, dtype=np.bool_)
         for span in spans:
@@ -478,11 +476,11 @@ class _Resolution:
         return [span for span in self._spans() if is_open[self._own(span)].any()]
 
     def _let_go(self, span: range, faults: Sequence[int]) -> bool:
-        """Keep no contacts near frames of a span that are worse; return whether there were any.
+        """Drop the kept contacts near faults of a span; return whether there were any.
 
         Parameters
         ----------
-        faults : places in the span
+        faults : positions in the span
         """
         contacts, own = self.frames.kept_contacts, self._own(span)
         if contacts is None:
@@ -505,7 +503,7 @@ class _Resolution:
         return [_fractions(self.options.substeps)] * self.n
 
     def _soften(self) -> None:
-        """Take overlap from frames that were left out, where that makes nothing worse."""
+        """Reduce the overlap of barred frames, where that makes nothing worse."""
         for run in colliding_spans(self.colliding & self.barred, 0, None, self.is_cycle):
             span = self._eased(run)
             own = self._own(span)
@@ -529,7 +527,7 @@ class _Resolution:
                 if not faults:
                     break
                 self._put_back(span)
-                # Those stay, and the others settle round them.
+                # Keep the faults still, and smooth the others around them.
                 still |= {
                     places[beside]
                     for at in faults
@@ -538,7 +536,7 @@ class _Resolution:
                 }
 
     def _smoothed(self, span: range, wanted: FloatArray, still: set[int]) -> FloatArray:
-        """Return (len(span), D) corrections near wanted ones, smooth over time, 0 where `still`."""
+        """Return smooth (len(span), D) corrections near the wanted ones, 0 in frames `still`."""
         size = wanted.shape[1]
         is_open = not self.is_cycle and span.start == 0, not self.is_cycle and span.stop == self.n
         before, after = (None if is_end_open else np.zeros((2, size)) for is_end_open in is_open)
@@ -547,7 +545,7 @@ class _Resolution:
         return kernel.spread @ wanted
 
     def _eased(self, run: range) -> range:
-        """Return a run with the frames on both sides over which its correction may fade."""
+        """Extend a run by the frames on both sides over which its correction may fade."""
         may_ease = ~(self.is_changed | self.colliding)
         may_ease &= np.isin(np.arange(self.n), np.asarray(self.within) % self.n)
 
@@ -572,13 +570,13 @@ class _Resolution:
 
 
 class _Credit:
-    """The share of some frames that is done, as part of a resolution."""
+    """Progress of some frames, as part of a resolution."""
 
     def __init__(self, run: _Resolution, n_frames: int) -> None:
         self._run, self._n_frames, self._told = run, n_frames, 0.0
 
     def tell(self, share: float) -> None:
-        """Report so much of the frames, in [0, 1]; it never falls."""
+        """Report the share of the frames that is done, in [0, 1]; it never falls."""
         run = self._run
         with run.lock:
             gain = self._n_frames * max(0.0, share - self._told)
@@ -588,7 +586,7 @@ class _Credit:
 
 
 def _contacts_of(motion: Motion, options: MotionOptions) -> KeptContacts | None:
-    """Return what touches in each frame that is to do so; a cycle's gone through twice."""
+    """Return the contacts to keep, for two turns of a cycle."""
     contacts = motion.contacts() if options.keep_contacts and motion.contacts is not None else None
     if contacts is None or not motion.is_cycle:
         return contacts
@@ -596,14 +594,14 @@ def _contacts_of(motion: Motion, options: MotionOptions) -> KeptContacts | None:
 
 
 def _added(targets: FloatArray, corrections: FloatArray) -> FloatArray:
-    """Add corrections to frames; to add nothing changes no bit."""
+    """Add corrections to frames; adding 0 changes no bit."""
     return np.where(corrections != 0.0, targets + corrections, targets)
 
 
 def _free_pairs(
     free: npt.NDArray[np.bool_], again: npt.NDArray[np.intp], within: range
 ) -> npt.NDArray[np.intp]:
-    """Return the frames within a range that are free, and so is the next."""
+    """Return the frames that, like the next one, are free and within a range."""
     usable = free[again] & np.isin(np.arange(len(again)), within)
     return np.flatnonzero(usable[:-1] & usable[1:])
 

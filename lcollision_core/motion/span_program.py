@@ -1,9 +1,9 @@
-"""The quadratic programme that frees the frames of a span smoothly.
+"""The quadratic program that frees the frames of a span smoothly.
 
-Minimises sum_t |c_t|^2 + w |c_{t-1} - 2 c_t + c_{t+1}|^2, with |c|^2 = c^T G c, over the
-corrections c_t of the frames of a span. Its Hessian is A (x) G with A = I + w D2^T D2, so that the
-program is solved in the multipliers of the constraints, of which there are few: its dual Hessian
-has the entries (a_i^T A^-1 a_j) (n_i^T G^-1 n_j).
+It minimises sum_t |c_t|^2 + w |c_{t-1} - 2 c_t + c_{t+1}|^2, with |c|^2 = c^T G c, over the
+corrections c_t of the frames of a span. Its Hessian is A (x) G with A = I + w D2^T D2. The program
+is solved in the multipliers of the constraints, of which there are few: its dual Hessian has the
+entries (a_i^T A^-1 a_j) (n_i^T G^-1 n_j).
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from lcollision_core.motion.contacts import Pulls
 from lcollision_core.motion.frames import Frames, HalfSpacesOfPose
 
 SOFTNESS, _PULLED, _LEVEL = 1e-4, 1e-2, 1e-3
-"""Added to the normalised dual Hessian: contacts that contradict each other give way a little, more
-those that are to be kept, as of two patches or of one with the ground."""
+"""Added to the normalised dual Hessian: contradictory contacts give way a little, and kept ones, of
+two patches or of one with the ground, give way more."""
 
 _LEAST_REACH = 1e-9
-"""Squared change of a constraint by a correction of cost 1. What reaches less has no say in it, as
-where all that could move it is locked or pinned."""
+"""Least squared change of a constraint by a correction of cost 1. Constraints below it are ignored,
+as when all codes that could change them are locked or pinned."""
 
 _TOLERANCE, _MOST_ITERATIONS, _PATIENCE = 1e-8, 2000, 3
-"""Of what a half-space leaves, and iterations: of all, and of those that do not help in a row."""
+"""Tolerance of a half-space, most iterations, and most successive ones without progress."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +39,9 @@ class HalfSpaces:
 
     Attributes
     ----------
-    shares : (M, n) float64 array; a frame's own constraint has one 1
+    shares : (M, n) float64 array; a constraint of one frame has a single 1
     normals, offsets : (M, D) and (M,) float64 arrays
-    softness : of all of them, or (M,): see `SOFTNESS`
+    softness : of all constraints, or (M,): see `SOFTNESS`
     """
 
     shares: FloatArray
@@ -50,7 +50,7 @@ class HalfSpaces:
     softness: FloatArray | float = SOFTNESS
 
     def joined(self, other: HalfSpaces) -> HalfSpaces:
-        """Return these constraints and others."""
+        """Concatenate these constraints and others."""
         return HalfSpaces(
             np.concatenate([self.shares, other.shares]),
             np.concatenate([self.normals, other.normals]),
@@ -63,12 +63,12 @@ class HalfSpaces:
 
 @dataclass(frozen=True, eq=False)
 class TimeKernel:
-    """The smoothest corrections of n frames without constraints, and how far they yield.
+    """The smoothest corrections of n frames without constraints, and their covariance over time.
 
     Attributes
     ----------
-    spread : (n, n) float64 array, A^-1 of the frames that may change, 0 for those that are pinned
-    mean : (n, D) float64 array: where the corrections lie without constraints
+    spread : (n, n) float64 array, A^-1 of the frames that may change, 0 for pinned ones
+    mean : (n, D) float64 array, the corrections without constraints
     """
 
     spread: FloatArray
@@ -85,17 +85,17 @@ class TimeKernel:
         size: int,
         is_cycle: bool = False,
     ) -> TimeKernel:
-        """Condition the program on corrections that are given.
+        """Condition the program on given corrections.
 
         Parameters
         ----------
-        n : frames
+        n : number of frames
         smoothness : w
         before, after : (2, D) corrections of the two frames on either side; None at an end of the
-            motion, which is left as smooth as it comes
-        pinned : corrections of frames that are to keep them
+            motion, where nothing constrains the smoothness
+        pinned : fixed corrections, by frame
         size : D
-        is_cycle : the first frame comes after the last; none are given on either side
+        is_cycle : whether the first frame follows the last; `before` and `after` are then None
         """
         given = dict(pinned)
         lead, tail = (0 if row is None else 2 for row in (before, after))
@@ -135,9 +135,9 @@ def least_corrections(
     ----------
     kernel : of the frames
     inverse_metric : (D, D) G^-1; rows and columns of codes that may not change are 0
-    constraints : that hold at the result, up to their softness, but for those that no change
-        reaches
-    equations : further constraints, on whose borders the result lies
+    constraints : inequalities of the result, up to their softness; those that no correction can
+        change are ignored
+    equations : further constraints, as equalities
     """
     both = constraints if equations is None else equations.joined(constraints)
     shares, normals, offsets = both.shares, both.normals, both.offsets
@@ -156,7 +156,7 @@ def least_corrections(
     gram *= np.outer(scale, scale)
     gram[np.diag_indices_from(gram)] += np.broadcast_to(both.softness, len(counts))[counts]
     equal, rest = slice(n_equal), slice(n_equal, None)
-    # What the equations leave is a program of the half-spaces alone.
+    # Eliminate the equations, which leaves a program of the half-spaces.
     solved = np.zeros((n_equal, 1 + len(bounds) - n_equal))
     if n_equal:
         known = np.column_stack([bounds[equal], gram[equal, rest]])
@@ -178,13 +178,13 @@ def _pressed(gram: FloatArray, bounds: FloatArray) -> FloatArray | None:
     Parameters
     ----------
     gram : (M, M) dual Hessian, definite
-    bounds : (M,) what each half-space leaves
+    bounds : (M,) slack of each half-space at 0
 
     Notes
     -----
     Block principal pivoting: Júdice and Pires, "A block principal pivoting algorithm for
     large-scale strictly monotone linear complementarity problems", 1994. All half-spaces on the
-    wrong side change sides at once, and only one where that does not help.
+    wrong side change sides at once, or only one if that makes no progress.
     """
     presses, least, patience = bounds < 0.0, len(bounds) + 1, _PATIENCE
     for _ in range(_MOST_ITERATIONS):
@@ -211,7 +211,7 @@ _Block = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def stacked(blocks: Sequence[_Block], n: int, size: int, softness: float = SOFTNESS) -> HalfSpaces:
-    """Join blocks into one set of constraints."""
+    """Join blocks to one set of constraints."""
     if not blocks:
         return HalfSpaces(np.zeros((0, n)), np.zeros((0, size)), np.zeros(0))
     offsets = np.concatenate([offsets for _, _, offsets in blocks])
@@ -224,54 +224,58 @@ def stacked(blocks: Sequence[_Block], n: int, size: int, softness: float = SOFTN
 
 
 SMOOTHNESS = 300.0
-"""w at 30 frames a second: acceleration against displacement. A third of it stays nearer to the
-motion and adds a tenth to its acceleration."""
+"""w at 30 frames a second: the weight of acceleration relative to displacement. A third of it stays
+nearer to the motion and adds a tenth to its acceleration."""
 
 ROUNDS = 22
 _LEFT_BY_ROUND = 0.96
-"""Of the work, the share that a round is said to leave of what was left."""
+"""Share of the remaining work that a round is reported to leave."""
 
 _RESOLVED_AT = (6, 8, 10, 12)
 """Rounds in which frames that still collide look for a free pose next to the smooth one."""
 
 _PINNED_AT = (14, 17, 20)
-"""Rounds in which frames that still collide are put where they are free, and the others settle
-smoothly round them."""
+"""Rounds in which frames that still collide are pinned to free poses, and the others settle
+smoothly around them."""
 
 _PIN_REACH = 0.015
-"""Normalised: in all but the last of these rounds, only frames that a free pose is this near to."""
+"""Normalised distance of a free pose up to which frames are pinned, except in the last of these
+rounds."""
 
 _STALLED, _NEARER = 4, 0.95
-"""Rounds after which patches that do not come nearer are left apart, where all is free; and the
-share of what they lacked below which they have."""
+"""Rounds without progress after which patches are left apart, if all is free, and the share of
+their lacking distance below which there is progress."""
 
 _SEARCHES, _SETTLED = 6, 0.98
-"""How often a span is searched at most, and the share of its cost that a further search must not
-exceed for there to be another."""
+"""Most searches of a span, and the share of the cost that another search must go below to count as
+better."""
 
 _REMEMBERED = 6, 3
-"""Poses whose contacts count, of each frame and between frames."""
+"""Number of poses whose contacts are used, for each frame and between frames."""
 
 _NEAR, _HALVINGS = 0.004, 3
-"""Contacts are taken where a frame, on the way from a free pose, begins to collide."""
+"""Distance and number of halvings to find where a frame, on the way from a free pose, begins to
+collide; contacts are taken there."""
 
 _REFUTED, _SLACK = 5e-4, 1e-5
-"""Normalised: half-spaces that a free pose violates by more are dropped, others give way to it."""
+"""Half-spaces that a free pose violates by more than the first, normalised, are dropped; the others
+are moved to hold it with the second."""
 
 _BEYOND, _BOUNDED, _BOUND_ROUNDS = 0.01, 60, 3
-"""Codes beyond their limits by more become constraints, so many in a round, the farthest first."""
+"""Excess beyond their limits from which codes become constraints, the most of these in a round, the
+farthest first, and the most rounds."""
 
 
 class _Looked(NamedTuple):
-    """Corrections of the frames of a span, and what collides with them.
+    """Corrections of the frames of a span, and their collisions.
 
     Attributes
     ----------
     corrections : (n, D)
-    is_free : (n,) which frames are free
-    between : frames that are free, and so is the next, with a pose between that is not
-    n_apart : patches that are to touch and do not, counted in each frame
-    lack : what all of them are too far apart, normalised
+    is_free : (n,) whether each frame is free
+    between : frames that are free like the next, but with a colliding pose between
+    n_apart : number of patches, summed over frames, that should touch and do not
+    lack : sum of the distances that they lack, normalised
     """
 
     corrections: FloatArray
@@ -282,30 +286,31 @@ class _Looked(NamedTuple):
 
     @property
     def score(self) -> float:
-        """How much collides."""
+        """The number of colliding frames, plus half that of colliding poses between."""
         return float(np.count_nonzero(~self.is_free)) + 0.5 * len(self.between)
 
     @property
     def rank(self) -> tuple[float, int]:
-        """How much collides, and of what collides equally, how much is apart; less is better."""
+        """Sort key, less is better: the score, then the number of patches apart."""
         return self.score, self.n_apart
 
 
 @dataclass(eq=False)
 class SpanProgram:
-    """The corrections of the frames of a span.
+    """Find the corrections of the frames of a span.
 
     Parameters
     ----------
     frames : of the motion
-    span : its frames, n of them
-    start : (n, D) corrections to begin with
-    is_free : (n,) which frames are free with them
+    span : its n frames
+    start : (n, D) initial corrections
+    is_free : (n,) whether each frame is free with them
     before, after : (2, D) corrections of the two frames on either side, or None: see `TimeKernel`
     smoothness : w
-    fractions : for each of the n frames, of the way to the next, of poses that are to be free too
-    is_cycle : the first frame comes after the last
-    tell : called with the share that is done, in [0, 1): how many rounds it takes is not known
+    fractions : for each of the n frames, fractions of the way to the next of poses that must be
+        free too
+    is_cycle : whether the first frame follows the last
+    tell : called with an estimate of the share done, in [0, 1)
     """
 
     frames: Frames
@@ -328,18 +333,18 @@ class SpanProgram:
     def __post_init__(self) -> None:
         self._targets = self.frames.motion.codes[self.span.start : self.span.stop]
         self._contacts = [[] for _ in self.span]
-        # The newest free pose of each frame, where one is known.
+        # The newest known free pose of each frame.
         self._known, self._is_known = self._targets + self.start, self.is_free.copy()
         bounds = [self.frames.limits(frame) for frame in self.span]
-        # Whether half-spaces give way to known free poses, which frees less and bends less.
+        # Whether half-spaces are moved to hold known free poses: frees less, but bends less.
         self._gives_way = True
         self._low, self._high = (np.array(side) for side in zip(*bounds, strict=True))
 
     def solve(self) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-        """Return the (n, D) corrections, and which of the n frames are free with them."""
+        """Return the (n, D) corrections, and (n,) whether each frame is free with them."""
         best, gives_way = self._search(), True
         if best.n_apart and self._let_go(best):
-            # What does not come together is no reason to move.
+            # Search again without the touches that stay apart.
             best = self._search()
         for _ in range(1, _SEARCHES):
             if self._is_settled(best) and (best.score > 0.0 or not best.corrections.any()):
@@ -371,7 +376,7 @@ class SpanProgram:
         return bool(apart)
 
     def _forget(self, best: _Looked) -> None:
-        """Keep of a search only where it ended: contacts met elsewhere led a long way round."""
+        """Forget a search but for its result: contacts met elsewhere lead to detours."""
         for seen in (*self._contacts, *self._between.values()):
             seen.clear()
         self._limits.clear()
@@ -380,7 +385,7 @@ class SpanProgram:
         self._is_known |= best.is_free
 
     def _search(self) -> _Looked:
-        """Return the first corrections that free all, else the best of some rounds."""
+        """Return the first corrections that free all frames, else the best of all rounds."""
         n = len(self._targets)
         start = self._look(np.zeros(self._targets.shape), {}, resolves=False)
         if start.score == 0.0 and not start.n_apart:
@@ -389,7 +394,7 @@ class SpanProgram:
         kernel, now, best = self._kernel(pinned), start, start
         least, n_stalled = start.lack, 0
         for number in range(ROUNDS):
-            # Two neighbours that are pinned leave what is between them no way out.
+            # Two pinned neighbours would leave a pose between them no way out.
             released = [at for at in now.between if at in pinned and (at + 1) % n in pinned]
             for at in released:
                 pinned.pop(at, None)
@@ -400,34 +405,34 @@ class SpanProgram:
                 kernel = self._kernel(pinned)
             moved = self._settle(kernel, pinned)
             corrections = now.corrections.copy() if moved is None else moved
-            # They are there even where the others found no place.
+            # Apply pinned corrections even if the solver failed.
             for at, correction in pinned.items():
                 corrections[at] = correction
             now = self._look(corrections, pinned, number + 1 in _RESOLVED_AT)
             self._rounds += 1
             self.tell(1.0 - _LEFT_BY_ROUND**self._rounds)
             if number + 1 in _RESOLVED_AT:
-                # What contacts ask for where no pose is free keeps the others from settling.
+                # Contacts of frames without a known free pose would keep the others from settling.
                 self._hopeless |= set(np.flatnonzero(~(now.is_free | self._is_known)).tolist())
             n_stalled = 0 if now.lack < _NEARER * least else n_stalled + 1
             least = min(least, now.lack)
             if self._is_settled(now) and (now.n_apart == 0 or n_stalled >= _STALLED):
                 is_better = now.rank <= min(best.rank, (now.score, start.n_apart))
                 return now if is_better and (now.score == 0.0 or now.score < start.score) else best
-            # What frees nothing, and brings nothing together, is no reason to move.
+            # Corrections must be better than none.
             if now.rank <= best.rank and now.rank < start.rank:
                 best = now
         return best
 
     def _is_settled(self, now: _Looked) -> bool:
-        """Whether all is free but frames of which no free pose is known, which were looked for."""
+        """Whether all is free except frames for which no free pose was found."""
         stuck = set(np.flatnonzero(~now.is_free).tolist())
         return stuck <= self._hopeless - set(np.flatnonzero(self._is_known)) and not now.between
 
     def _stuck(self, now: _Looked, reach: float | None) -> list[int]:
-        """Return the frames that collide and have a known free pose, within a reach of theirs.
+        """Return the colliding frames that have a known free pose within a reach.
 
-        A neighbour's correction may free a frame, nearer than what was known.
+        A neighbour's correction may give a frame a nearer free pose.
         """
         n, frames, stuck = len(self._targets), self.frames, []
         for at in np.flatnonzero(~now.is_free).tolist():
@@ -445,7 +450,7 @@ class SpanProgram:
         return stuck
 
     def _cost(self, corrections: FloatArray) -> float:
-        """Return what the program minimises."""
+        """Return the objective of the program."""
         rows = np.concatenate([corrections, corrections[:2]]) if self.is_cycle else corrections
         known = [side for side in (self.before, rows, self.after) if side is not None]
         bends = np.diff(np.concatenate(known), 2, axis=0)
@@ -499,7 +504,7 @@ class SpanProgram:
         return _Looked(corrections, is_free, between, n_apart, lack)
 
     def _reached(self, at: int, goal: FloatArray, resolves: bool) -> bool:
-        """Take the contacts of one frame on its way to a pose; return whether that is free."""
+        """Collect the contacts of one frame on its way to a pose; return whether that is free."""
         frames, frame = self.frames, self.span[at]
         contacts = frames.contacts(frame, goal)
         if contacts is None:
@@ -566,7 +571,7 @@ class SpanProgram:
         return moved
 
     def _pulled(self, pinned: dict[int, FloatArray]) -> tuple[list[_Block], list[_Block]]:
-        """Return what brings patches together, and equations of what stands in its place."""
+        """Return the constraints that bring patches together, and equations of anchored ones."""
         shares = np.eye(len(self._targets))
         both: tuple[list[_Block], list[_Block]] = [], []
         for at, pulls in self._pulls.items():
