@@ -88,7 +88,7 @@ class Bvh:
         return turned
 
     def places(self) -> FloatArray:
-        """Return the (T, J, 3) positions of the joints relative to their parents or the world."""
+        """Return the (T, J, 3) positions of joints relative to parents; a root's is global."""
         placed = np.broadcast_to(self.offsets, (len(self), *self.offsets.shape)).copy()
         for joint, (columns, axes) in enumerate(self._columns(_PLACES)):
             for column, axis in zip(columns, axes, strict=True):

@@ -61,7 +61,7 @@ class NodeMotion:
         return self._turns.copy()
 
     def places(self) -> FloatArray:
-        """Return the (T, J, 3) positions of the joints relative to their parents or the world."""
+        """Return the (T, J, 3) positions of joints relative to parents; a root's is global."""
         return self._places.copy()
 
 
