@@ -228,11 +228,13 @@ _STEPS_BETWEEN_TALKS = 20
 """Interval at which processes agree on whether to stop, which costs a round trip."""
 
 _TIMES_PATCHES_KEPT, _LEAST_PATCHES_KEPT = 20, 4096
-"""Patches are written after each twentieth of the training rows, but at least so many rows."""
+"""Number of parts of the training rows after each of which patches are written, and least rows of a
+part."""
 
 _STEPS_BETWEEN_CLEARINGS = 100
 _TINY_MOMENT = 1e-30
-"""Adam's mean, which falls by 0.9 a step, is still a normal number so many steps after this."""
+"""Steps between clearings, and the mean that is cleared: falling by 0.9 a step, Adam's means stay
+normal numbers in between."""
 
 _STEPS_BETWEEN_AVERAGES = 10
 """Steps between updates of the mean weights: one every step would take a sixth of the time."""
