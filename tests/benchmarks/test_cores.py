@@ -1,4 +1,4 @@
-"""The benchmark of threads times the same loops on one and on several."""
+"""The thread benchmark times the same loops on one thread and on several."""
 
 from __future__ import annotations
 

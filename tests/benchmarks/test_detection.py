@@ -1,4 +1,4 @@
-"""The detection benchmark runs, compares the right things, and says when they differ."""
+"""The detection benchmark runs, compares the right results, and reports differences."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ def test_the_command_prints_both_modes(lcollision: Lcollision) -> None:
     assert solid["confirmed_free_rate"] == 1.0
     assert 0.0 < plain["miss_reachable"] < 0.02
     assert plain["largest_stretch"] < 1.15
-    # The first four targets of each patch are without pins.
+    # The first four targets of each patch have no pins.
     assert plain["pin_drift"] is None
     assert 0.0 < plain["median_ms"] <= plain["p95_ms"] <= plain["max_ms"]
 

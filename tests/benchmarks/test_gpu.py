@@ -1,4 +1,4 @@
-"""The benchmark of a GPU compares what both devices find, here in numba's simulator."""
+"""The GPU benchmark compares the results of both devices, here in Numba's simulator."""
 
 from __future__ import annotations
 

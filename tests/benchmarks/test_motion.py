@@ -1,4 +1,4 @@
-"""The comparison of whole motions, on a small character."""
+"""The benchmark of motions, on a small character."""
 
 from __future__ import annotations
 

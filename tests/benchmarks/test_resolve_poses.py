@@ -1,4 +1,4 @@
-"""Poses that the benchmark of Resolve makes as a person would."""
+"""Poses that the Resolve benchmark makes as a person would."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Round trips, consistency and shapes of deformation features, on shapes that are known."""
+"""Round trips, consistency and array shapes of deformation features, on analytic shapes."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def twisted(mesh: Mesh, angle_at: Callable[[FloatArray], FloatArray]) -> FloatAr
 
 
 def bent(mesh: Mesh, angle: float) -> FloatArray:
-    """Bend the tube along z into an arc of that many radians about the y axis."""
+    """Bend the tube along z into an arc of `angle` radians about the y axis."""
     x, y, z = mesh.vertices.T
     turn = angle * z
     distance = 1.0 / angle - x
@@ -62,7 +62,7 @@ def codec_of(mesh: Mesh) -> AcapCodec:
 
 
 def round_trip_error(codec: AcapCodec, pose: FloatArray) -> float:
-    """Return the largest vertex error but for a translation, in the pose's unit."""
+    """Return the largest vertex error up to a translation, in the pose's unit."""
     rebuilt = codec.decode(codec.encode(pose[None]))[0]
     error = (rebuilt - rebuilt.mean(axis=0)) - (pose - pose.mean(axis=0))
     return float(np.linalg.norm(error, axis=1).max())
@@ -116,7 +116,7 @@ def test_stretched_sphere_returns_closely() -> None:
 
 def test_pose_turned_inside_out_returns_closely() -> None:
     mesh = sphere(n=24)
-    # Edges are negated and normals are not: half a turn about its normal at every vertex.
+    # Edges are negated but normals are not: half a turn about the normal at every vertex.
     pose = -mesh.vertices
     codec = codec_of(mesh)
     angles = np.linalg.norm(codec.encode(pose[None])[0, :, :3], axis=1)
@@ -141,14 +141,14 @@ def test_bent_tube_goes_right_through_half_a_turn(degrees: float) -> None:
 
 @pytest.mark.parametrize("turns", [0.5, 1.0, 1.5, 1.9])
 def test_tube_rolled_at_its_end_keeps_its_axis(turns: float) -> None:
-    """The forearm: most of the tube stands still, the last third is rolled over."""
+    """Like a forearm: most of the tube stays, and the last third is twisted."""
     tube = straight_tube(0.01, 81)
     pose = twisted(tube, lambda z: 2 * np.pi * turns * np.clip((z - 0.6) / 0.3, 0.0, 1.0))
     codec = codec_of(tube)
     features = codec.encode(pose[None])
     logs = features[0, :, :3].reshape(81, 12, 3)
     assert np.abs(logs[:40]).max() < 1e-5
-    # At the very full turn the axis is free, so only the rolled end's turning half is told.
+    # At exactly a full turn, the rolled end's axis is undetermined, so it is not compared.
     if turns != 1.0:
         assert logs[-5:] == pytest.approx(
             np.broadcast_to([0.0, 0.0, 2 * np.pi * turns], (5, 12, 3)), abs=1e-2
@@ -162,7 +162,7 @@ def test_tube_twisted_twice_is_wound_all_the_way() -> None:
     codec = codec_of(tube)
     features = codec.encode(pose[None])
     wound = features[0, :, 2].reshape(80, 12).mean(axis=1)
-    # At either rim the angle passes a full turn, where the shear of the surface leads the axis.
+    # At both rims the angle exceeds a full turn, and the surface's shear determines the axis.
     inner = slice(6, -6)
     expected = 4 * np.pi * np.linspace(0.0, 1.0, 80)[inner]
     offset = wound[inner] - expected

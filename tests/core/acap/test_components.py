@@ -1,4 +1,4 @@
-"""How the connected components of a mesh are joined, and keep their places in decoded poses."""
+"""Connected components of a mesh are joined, and keep their places in decoded poses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RADII, MIDDLES = (0.2, 0.1, 0.1, 0.1), (0.0, 0.31, 0.52, 0.73)
 
 
 def arm() -> tuple[Topology, np.ndarray, np.ndarray]:
-    """Return a large ball and three small ones in a row, and which ball each vertex is of."""
+    """Return a large ball and three small ones in a row, and the ball of each vertex."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     parts = [
         ball.vertices * radius + [x, 0.0, 0.0] for radius, x in zip(RADII, MIDDLES, strict=True)
@@ -57,7 +57,7 @@ def test_a_layer_is_joined_where_it_lies_and_not_to_what_faces_it() -> None:
     assert set(joined[:, 1]) == set(range(first, poses.topology.n_vertices))
     away = np.linalg.norm(rest[joined[:, 0]] - rest[joined[:, 1]], axis=1)
     assert away.max() < 0.03
-    # Two sheets that face each other, as a hand and a coat do, are joined by a few edges alone.
+    # Two facing sheets, like a hand and a coat, are joined by only a few edges.
     sheet = trimesh.creation.box((1.0, 1.0, 0.1)).subdivide().subdivide().subdivide().subdivide()
     vertices = np.concatenate([sheet.vertices, sheet.vertices + [0.0, 0.0, 0.11]])
     faces = np.concatenate([sheet.faces, sheet.faces + len(sheet.vertices)])
@@ -75,14 +75,14 @@ def test_a_layer_keeps_its_distance_in_a_pose_between_others() -> None:
     def moved(bridges: np.ndarray | None) -> float:
         codec = AcapCodec(poses.topology, vertices[0], anchors, bridges)
         features = codec.encode(vertices[[3, 7, 11]])
-        # As a new pose has them: of the sleeve a little other than of what it covers.
+        # As in a new pose: the sleeve's features differ a little from those of the covered skin.
         features[:, first:] *= 0.98
         decoded = codec.decode(features)
         away = np.linalg.norm(decoded[:, first:] - decoded[:, covered], axis=2)
         return float(np.abs(away - 0.01).max())
 
     joined = moved(component_bridges(poses.topology, vertices[0]))
-    # 0.5 % of the body size, half of the distance; three times that where few edges join them.
+    # 0.5 % of the body size, half the distance; three times that if few edges join them.
     assert joined < 0.005
     assert moved(None) > 2.0 * joined
 
@@ -92,7 +92,7 @@ def test_a_layer_turns_as_what_it_covers_beyond_half_a_turn() -> None:
     rest = poses.vertices[0] / body_size(poses.vertices[0], poses.topology)
     first = poses.topology.n_vertices - len(covered)
     along = rest[:, 1] - rest[:, 1].min()
-    # Wound by three quarters of a turn from end to end.
+    # Twisted by three quarters of a turn from end to end.
     turns = Rotation.from_rotvec(np.outer(4.7 * along, [0.0, 1.0, 0.0]))
     centre = rest.mean(axis=0) * [1.0, 0.0, 1.0]
     wound = turns.apply(rest - centre) + centre

@@ -1,4 +1,4 @@
-"""Round trips of the published pose sets, where they are at hand: half of the limits asked for."""
+"""Round trips of the published pose sets, if available, within half the required limits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_round_trip_of_aligned_poses(
     aligned = align_rigid(poses.vertices[::step] / body_size(poses.vertices[0]), reference)
     codec = AcapCodec(poses.topology, reference, aligned.weights)
     features = codec.encode(aligned.vertices)
-    # Anchored like the alignment, so that no translation is left to take out.
+    # Anchored like the alignment, so that no translation remains to be removed.
     error = np.linalg.norm(codec.decode(features) - aligned.vertices, axis=2)
     assert 0.0 < error.mean() < mean_limit
     assert error.max() < max_limit

@@ -1,4 +1,4 @@
-"""Polar factors, the exponential map, and logarithms that agree along the mesh."""
+"""Polar factors, the exponential map, and consistent logarithms along the mesh."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_quaternion_agrees_with_the_exponential_in_every_branch() -> None:
             assert quaternion[0] == pytest.approx(np.cos(angle / 2), abs=1e-9)
             expected = np.sin(angle / 2) * axis
             if angle == np.pi:
-                # Either sign of the axis is the same half turn.
+                # Both signs of the axis give the same half turn.
                 expected = expected * np.sign(expected @ quaternion[1:])
             assert quaternion[1:] == pytest.approx(expected, abs=1e-9)
 
@@ -128,7 +128,7 @@ def test_features_of_gradients_give_the_gradients_back() -> None:
 
 
 def logarithms(topology: Topology, vectors: FloatArray, roots: list[int]) -> tuple[FloatArray, int]:
-    """Forget the turns of rotation vectors and find consistent ones again."""
+    """Drop the full turns of rotation vectors, and restore consistent ones."""
     quaternions, _ = split(np.stack([exponential_of(vector) for vector in vectors]))
     ring = topology.adjacency
     logs = np.empty_like(vectors)
@@ -160,7 +160,7 @@ def test_root_takes_the_turn_that_keeps_most_vertices_small() -> None:
 def test_walk_goes_round_a_cut_and_not_across() -> None:
     mesh = grid(12)
     x, y = mesh.vertices[:, 0] - 0.52, mesh.vertices[:, 1] - 0.52
-    # Winds up by 4 radians round the middle: across the cut that looks like -2.3, the shorter way.
+    # It winds by 4 radians around the middle; across the cut, the shorter way is -2.3.
     vectors = np.zeros((169, 3))
     vectors[:, 2] = 4.0 * (np.arctan2(y, x) % (2 * np.pi)) / (2 * np.pi)
     root = int(np.argmin(np.abs(vectors[:, 2] - 2.0)))

@@ -1,4 +1,4 @@
-"""What joints are whatever they are called: by the skeleton, the names and the user together."""
+"""Roles of joints, from the skeleton, the names and the user's choices."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ NAMINGS = {
 
 
 def bends(space: RigPoseSpace, upper: str, lower: str, end: str) -> FloatArray:
-    """Return how far an end moves ahead, up and left, of bones' length, where its hinge turns.
+    """Return how far an end moves forward, up and left, in bone lengths, when its hinge turns.
 
     The upper bone is where it is at rest; those of 80 random poses that bend by 3 degrees or more.
     """
@@ -184,7 +184,7 @@ def test_what_the_user_says_counts() -> None:
     assert space.roles[3:5] == (Role.THIGH, Role.SHIN)
     assert [space.sides[joint].value for joint in (3, 4)] == ["left", "left"]
     assert space.part_names[space.part_of_joint[4]] == "Left shin"
-    # A joint of a person that is none of it after all.
+    # A joint with a person's name that is not a person's.
     person = character_from(PERSON)
     assert person.rig is not None
     person = replace(person, rig=replace(person.rig, chosen={"L shin": "unknown"}))
@@ -233,7 +233,7 @@ def test_many_strands_of_hair_are_no_limbs() -> None:
 
 
 def test_what_is_above_a_thigh_is_no_shin() -> None:
-    """Animals' rigs may call the haunch a leg, and its bones upper and lower leg."""
+    """Animal rigs may call the haunch a leg, and its bones upper and lower leg."""
     names = {
         "pelvis": "Back",
         **{

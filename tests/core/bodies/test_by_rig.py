@@ -1,4 +1,4 @@
-"""Poses to learn from that a rig makes."""
+"""Training poses made by a rig."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def joint_of(body: RigBody, name: str) -> int:
 
 
 def codes_of(body: RigBody, n: int, seed: int = 0) -> np.ndarray:
-    """Draw the codes of poses, of which no collision is looked at."""
+    """Draw the codes of poses without checking collisions."""
     return random_codes(body.space, n, np.random.default_rng(seed))
 
 
@@ -84,7 +84,7 @@ def test_poses_reach_far_into_their_limits_and_combine_few_to_many_limbs(body: R
     )
     shares = np.bincount(moves.sum(axis=0), minlength=5) / len(codes)
     assert shares[1:].min() > 0.05
-    # Joints of a limb move together, those of others by themselves.
+    # Joints of one limb move together, those of different limbs independently.
     for joints in limbs.values():
         ways = [codes[:, space.joint_of_code == joint].any(axis=1) for joint in joints]
         np.testing.assert_array_equal(ways[0], ways[1])
@@ -98,7 +98,7 @@ def test_left_and_right_are_alike(body: RigBody) -> None:
     mean, spread = vertices.mean(axis=0), vertices.std(axis=0)
     np.testing.assert_allclose(symmetry.image(mean), mean, atol=0.02 * SCALE)
     np.testing.assert_allclose(spread[symmetry.partner], spread, atol=0.02 * SCALE)
-    # An arm goes down as far as a person's, whichever way its axes turn.
+    # An arm can be lowered as far as a person's, whatever its axes.
     limits = HumanDraws(body.space).limits
     left, right = (
         np.degrees(limits[joint_of(body, side + "Arm"), 2]) for side in ("Left", "Right")
@@ -142,7 +142,7 @@ def test_equal_seeds_give_equal_poses_on_any_number_of_threads(
 
 
 def test_a_body_that_always_collides_ends_and_keeps_the_least(body: RigBody) -> None:
-    # All its limbs end in one place, the chest.
+    # All its limbs end at one point, the chest.
     character = body.character
     shoved = character.rest_vertices.copy()
     label = rest_pose_set(character).vertex_labels

@@ -54,7 +54,7 @@ def changed(source: Path, path: Path, change: Callable[[dict[str, Any]], None]) 
 
 
 def strip(description: dict[str, Any]) -> None:
-    """Leave out all but the nodes and the animations."""
+    """Keep only the nodes and the animations."""
     for node in description["nodes"]:
         node.pop("mesh", None)
         node.pop("skin", None)
@@ -63,7 +63,7 @@ def strip(description: dict[str, Any]) -> None:
 
 
 def pose_as_in_the_middle(description: dict[str, Any], turns: dict[str, FloatArray]) -> None:
-    """Store the nodes in a pose that is none of rest, as exporters do."""
+    """Store the nodes in a pose other than the rest pose, as exporters do."""
     strip(description)
     for node in description["nodes"]:
         if node.get("name") in turns:
@@ -107,7 +107,7 @@ def test_a_pose_that_the_file_stores_is_no_rest_pose(hero: Path, tmp_path: Path)
 def test_an_fbx_without_a_mesh_moves_its_character(hero: Path, tmp_path: Path) -> None:
     body = open_body(hero)
     path = character_fbx(swinging_body(), tmp_path / "swing.fbx")
-    # Its geometry and its skin hang on nothing.
+    # Its geometry and its skin are not connected to anything.
     text = path.read_text().replace('C: "OO",1,2\n', "").replace('C: "OO",5,1\n', "")
     path.write_text(text)
     motions = read_motions(body, path)
@@ -118,7 +118,7 @@ def test_an_fbx_without_a_mesh_moves_its_character(hero: Path, tmp_path: Path) -
 
 
 def villain(hero: Character, path: Path) -> Path:
-    """Write a character with other names, of another size, whose arms hang somewhat at rest."""
+    """Write a character with other names and another size, whose arms hang a little at rest."""
     rig = hero.rig
     assert rig is not None
     names = {"Hips": "pelvis", "Spine": "spine_01", "Neck": "neck_01", "Head": "head"}
@@ -140,7 +140,7 @@ def villain(hero: Character, path: Path) -> Path:
             if name.startswith(side) and ("Arm" in name or "Hand" in name)
         ]
         for joint in below:
-            # Only the places change: all joints of these files are turned alike at rest.
+            # Only positions change: all joints of these files have the same rotation at rest.
             rest[joint, :3, 3] = (moved @ rest[joint])[:3, 3]
             led = rig.joint_of == joint
             points[led] = points[led] @ moved[:3, :3].T + moved[:3, 3]
@@ -201,7 +201,7 @@ def test_joints_follow_as_a_file_says(
     expected = {**match.followed, "LeftArm": "RightArm", "LeftForeArm": None}
     assert changed_match.followed == expected
     assert other.fingerprint == body.fingerprint
-    # What is remembered does the same without a file.
+    # The remembered match has the same effect without a file.
     remember_followed(match, expected)
     for own, theirs in zip(read_motions(body, path), read_motions(other, path), strict=True):
         np.testing.assert_array_equal(own.codes, theirs.codes)

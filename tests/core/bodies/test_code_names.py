@@ -1,4 +1,4 @@
-"""What each code is called after what it does, and the body parts that a user edits."""
+"""Names of codes from their effects, and body parts edited by the user."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lcollision_core.model_file import read_model_file, write_model_file
 FloatArray = npt.NDArray[np.float64]
 UP, FRONT = 2, np.array([0.0, -1.0, 0.0])
 
-# An arm along x, at the body's left, a column from the ground up, and the other arm.
+# An arm along x at the body's left, a column from the ground up, and the other arm.
 ARM = np.stack(np.meshgrid(np.linspace(1, 3, 9), [-0.1, 0.1], [1.9, 2.1]), -1).reshape(-1, 3)
 TRUNK = np.stack(np.meshgrid([-0.3, 0.3], [-0.2, 0.2], np.linspace(0, 2, 9)), -1).reshape(-1, 3)
 OTHER = ARM * [-1.0, 1.0, 1.0]
@@ -35,7 +35,7 @@ def turned(points: FloatArray, axis: int, angle: float, about: FloatArray) -> Fl
 
 
 def effect_of(domain: int, move: Callable[[FloatArray, float], FloatArray]) -> CodeEffect:
-    """Return the effect of a domain's code of the whole body, which moves the body."""
+    """Return the effect of a domain's whole-body code that moves the body by `move`."""
 
     def decode(latent: FloatArray) -> FloatArray:
         return np.stack([move(BODY, float(row[domain])) for row in latent])
@@ -68,7 +68,7 @@ def moving(domain: int, change: Callable[[FloatArray, float], FloatArray]) -> Co
 @pytest.mark.parametrize("domain", [0, 1])
 def test_a_shift_is_named_after_its_direction(domain: int, way: list[float], motion: str) -> None:
     found = moving(domain, lambda part, share: part + 0.2 * share * np.array(way))
-    # The arm lies on the left.
+    # The arm is on the left.
     aside = {"left": "out", "right": "in"} if domain == 0 else {}
     assert found == CodeEffect(domain, aside.get(motion, motion))
 
@@ -92,7 +92,7 @@ def test_a_turn_about_the_long_axis_is_a_twist_and_another_a_bend() -> None:
     arm, trunk = ARM.mean(axis=0), TRUNK.mean(axis=0)
     assert moving(0, lambda p, s: turned(p, 0, 0.4 * s, arm)) == CodeEffect(0, "twist")
     assert moving(1, lambda p, s: turned(p, 2, 0.4 * s, trunk)) == CodeEffect(1, "twist")
-    # About x the top of the trunk goes back, about y to its left; the arm's end goes down.
+    # About x, the top of the trunk moves back, about y to its left; the arm's end moves down.
     assert moving(1, lambda p, s: turned(p, 0, -0.4 * s, trunk)).motion == "bend back"
     assert moving(1, lambda p, s: turned(p, 0, 0.4 * s, trunk)).motion == "bend forward"
     assert moving(1, lambda p, s: turned(p, 1, 0.4 * s, trunk)).motion == "bend left"
@@ -144,7 +144,7 @@ def test_names_within_a_group_differ() -> None:
     effects = [up, arm_up, up, up, arm_up, twist, twist, arm_up]
     names = code_names(effects, ("trunk", "arm"), (3, 4, 1))
     assert names == ("trunk up", "arm up", "trunk up 2", "up", "arm up", "twist", "twist 2", "up")
-    # A domain may be called as a numbered motion is.
+    # A domain may have the name of a numbered motion.
     names = code_names([up, CodeEffect(1, "up"), up], ("a", "a up 2"), (3, 0, 0))
     assert len(set(names)) == 3
 
@@ -179,7 +179,7 @@ def test_edited_parts_come_back_and_what_is_learnt_stays(
     assert np.array_equal(again.decode(pose), tube_model.decode(pose))
     groups = again.latent_space.groups
     assert [group.name for group in groups[1:]] == list(again.domain_names)
-    # By its own order the file is as before there was any.
+    # In the original order, the file is as before any reordering.
     plain = edited.edit_domains(order=[0, 1])
     assert plain.domain_order == (0, 1)
 

@@ -1,4 +1,4 @@
-"""Creases of joints, which do not count, and contact beside them, which does."""
+"""Creases of joints, which do not count, and contacts beside them, which do."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def thick_tube(radius: float) -> Character:
 
 
 def found_in(character: Character, turns: dict[str, float], rules: ContactRules) -> SelfCollisions:
-    """Check a pose of joints that turn about x, by angles in degrees."""
+    """Check a pose with joints turned about x, by angles in degrees."""
     rig = character.rig
     assert rig is not None
     angles = [np.radians(turns.get(name, 0.0)) for name in rig.joint_names]
@@ -157,7 +157,7 @@ def curled(*angles: float) -> dict[str, float]:
 
 
 def test_the_fingers_of_a_fist_count_against_the_palm() -> None:
-    """Though a whole hand lies within the near exclusion of a body."""
+    """Although the whole hand lies within the body's near exclusion."""
     hand = coarse_hand()
     rules = default_rules(hand, joint_groups(hand))
     rig, faces = hand.rig, hand.topology.faces
@@ -173,7 +173,7 @@ def test_the_fingers_of_a_fist_count_against_the_palm() -> None:
 
 
 def test_the_fingers_of_a_fused_hand_count_as_they_close(tmp_path: Path) -> None:
-    # Of SMPL-X's layout, with fingers that share their skin.
+    # In SMPL-X's layout, with fingers that share their skin.
     turns = np.zeros((10, 55, 3))
     turns[:, 25:40] = np.linspace(0.0, 1.0, 10)[:, None, None] * [0.4, 0.8, -1.333]
     path = tmp_path / "fist.npz"

@@ -1,4 +1,4 @@
-"""Damaged clips of every kind: each is read, or refused by one sentence that names it."""
+"""Damaged clips of every kind: each is read, or refused in one sentence that names it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def body() -> RigBody:
 
 @pytest.fixture(scope="module")
 def clips(body: RigBody, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a sound clip of each kind, "clip.KIND"."""
+    """Return a folder with an intact clip of each kind, "clip.KIND"."""
     from lcollision_core.files.motion.generated import _SMPL as SMPL
 
     folder = tmp_path_factory.mktemp("sound")
@@ -96,7 +96,7 @@ def require_one_sentence(
     damage: Callable[[bytearray, np.random.Generator], bytes],
     seed: int,
 ) -> bool:
-    """Read a damaged clip, and return whether it was refused, which must be in one sentence."""
+    """Read a damaged clip, and return whether it was refused; that must be in one sentence."""
     path.write_bytes(damage(bytearray(sound.read_bytes()), np.random.default_rng(seed)))
     before = {one.name for one in path.parent.iterdir()}
     try:

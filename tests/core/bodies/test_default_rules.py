@@ -1,4 +1,4 @@
-"""The contact rules that characters start with."""
+"""The default contact rules of characters."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def detector_of(character: Character, rules: ContactRules) -> CollisionDetector:
 
 
 def touching_body() -> Character:
-    """Return a body whose left forearm goes through its right one at rest."""
+    """Return a body whose forearms cross at rest."""
     body = rigged_body()
     vertices = body.rest_vertices.copy()
     left = vertices[:, 0] > 0.5
@@ -51,7 +51,7 @@ def test_only_a_rig_has_folds() -> None:
     assert default_rules(tube) == ContactRules(0.1, rest_exclusion=0.02)
     with_joints = default_rules(tube, joint_groups(tube))
     assert with_joints == ContactRules(0.1, 0.02, joint_exclusion=True, near_by_limb=True)
-    # Every verdict says so.
+    # Every verdict states it.
     said = "1 pair within 0.1 along the surface, less at thin limbs is not counted"
     assert with_joints.sentence({"near": 1}) == said
     assert default_rules(replace(tube, rig=None)) == ContactRules(rest_exclusion=0.02)
@@ -59,7 +59,7 @@ def test_only_a_rig_has_folds() -> None:
 
 def test_what_is_listed_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     body = touching_body()
-    # The package has the function under the name of its module.
+    # The package exports a function with the module's name.
     module = sys.modules["lcollision_core.bodies.rig_body"]
     rest, size = body.rest_vertices, detector_of(body, ContactRules()).body_size
     fitting = near_pairs_estimate(body.topology, rest, 0.05 * size)
@@ -97,7 +97,7 @@ def test_real_characters_are_free_at_rest_by_an_independent_reading(
 
 
 def test_a_thin_limb_that_rolls_up_meets_itself() -> None:
-    """All of it is near along the surface, but its ends are no crease of a joint."""
+    """All of it is near along the surface, but its ends are not a joint's crease."""
     tube = rigged_tube(7)
     groups = joint_groups(tube)
     limbs = replace(default_rules(tube, groups), near_exclusion=0.9)

@@ -35,11 +35,11 @@ def body() -> LearnedBody:
 def test_a_file_stands_upright_and_faces_the_front_of_its_program(
     body: LearnedBody, tmp_path: Path, axes: ExportAxes, suffix: str
 ) -> None:
-    """The axes in the file, by what the importers do with the settings that they begin with.
+    """The axes in the file, given the importers' default settings.
 
-    Blender's OBJ importer takes -Z forward and Y up and turns them, those of PLY and STL take Y
-    forward and Z up and turn nothing, and who faces the front looks along its -y. Maya turns
-    nothing. Unreal changes the sign of y, which is no matter to x and z.
+    Blender's OBJ importer assumes -Z forward and Y up and rotates; those of PLY and STL assume Y
+    forward and Z up and rotate nothing; a body facing the front looks along -y. Maya rotates
+    nothing. Unreal flips the sign of y, which does not affect x and z.
     """
     up, front = {
         ExportAxes.MODEL: (Z, -Y),
@@ -88,14 +88,14 @@ def test_a_body_in_centimetres_is_written_in_the_unit_of_each_program(tmp_path: 
     latent = body.known_poses[1]
     vertices = body.exported_vertices(latent)
     size = np.ptp(vertices, axis=0).max()
-    # glTF counts in metres, by its standard.
+    # glTF's unit is the metre.
     for name, expected in (("arm.glb", 0.01 * size), ("arm.ply", 0.01 * size), ("a.obj", size)):
         axes = "blender" if name == "arm.ply" else "maya"
         written = write_pose(tmp_path / name, body, latent, vertices, None, ExportRequest(axes))
         read = read_mesh(tmp_path / name).vertices
         assert np.ptp(read, axis=0).max() == pytest.approx(expected, rel=1e-5)
         assert written.unit * np.ptp(written.vertices, axis=0).max() == pytest.approx(size)
-    # A mesh that was imported has its own unit, and goes back in it.
+    # An imported mesh is exported in its own unit.
     placed = RigidTransform(np.eye(3), np.zeros(3), 10.0)
     moved = placed.apply(vertices)
     write_pose(tmp_path / "back.glb", body, latent, moved, placed)

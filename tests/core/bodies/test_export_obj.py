@@ -47,7 +47,7 @@ def test_texture_coordinates_normals_and_names_arrive(body: RigBody, tmp_path: P
     )
     normals = np.repeat(normals / 4.0, 3, axis=0)
     shown = faces.ravel()
-    # OBJ counts them from the lower left corner of the picture, glTF from the upper left one.
+    # The UV origin is the image's lower left corner in OBJ, and the upper left one in glTF.
     expected = corners(places[shown], uv[shown] * [1.0, -1.0] + [0.0, 1.0], normals)
     found = read.faces.ravel()
     told = corners(read.vertices[found], read.visual.uv[found], read.vertex_normals[found])
@@ -78,7 +78,7 @@ def test_only_edges_that_are_sharp_at_rest_part_normals() -> None:
     normals, of_corner = corner_normals(ball.vertices, ball.faces, ball.vertices)
     assert len(normals) == len(ball.vertices)
     np.testing.assert_allclose(normals[of_corner], ball.vertices[ball.faces], atol=0.05)
-    # A pose that bends an edge sharply shades it as before.
+    # Shading stays smooth even if a pose bends an edge sharply.
     flat = ball.vertices * [1.0, 1.0, 0.01]
     bent, same = corner_normals(flat, ball.faces, ball.vertices)
     np.testing.assert_array_equal(same, of_corner)

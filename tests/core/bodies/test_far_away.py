@@ -1,4 +1,4 @@
-"""Meshes far from the origin, and in another unit: what is checked and said is what is written."""
+"""Meshes far from the origin and in another unit: the written mesh is checked and reported."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_a_mesh_beyond_doubles_is_not_fitted(tube_model: LearnedBody) -> None:
 
 
 def test_free_means_free_in_single_precision_too() -> None:
-    """A triangle that stands so near to another that float32 pushes it through."""
+    """A triangle is so near to another that rounding to float32 makes them intersect."""
     topology = Topology(np.arange(6).reshape(2, 3), 6)
     generator = np.random.default_rng(0)
     told = set()

@@ -1,5 +1,5 @@
-# ruff: noqa: RUF001 - names of MMD are as they are
-"""Fingers of the skeletons that programs make, segment by segment."""
+# ruff: noqa: RUF001 - names of MMD are used as they are
+"""Fingers of various programs' skeletons, segment by segment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motions of generators, as arrays of joints, on a character."""
+"""Generated motions, as arrays of joints, on a character."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ N_FRAMES = 5
 
 
 def posed(names: tuple[str, ...], parents: list[int]) -> tuple[FloatArray, FloatArray]:
-    """Return places and turns in the world of a skeleton of SMPL in random poses."""
+    """Return world positions and rotations of an SMPL skeleton in random poses."""
     vectors = np.random.default_rng(2).normal(0.0, 0.25, (N_FRAMES, len(names), 3))
     local = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
     turns = local.reshape(N_FRAMES, len(names), 3, 3)
@@ -157,7 +157,7 @@ def test_other_arrays_are_refused_by_what_was_expected(tmp_path: Path) -> None:
 
 
 class _Runs:
-    """What does something when it is unpickled."""
+    """An object that executes code when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -195,7 +195,7 @@ def test_mdm_results_are_motions_of_their_lengths(tmp_path: Path, order: str) ->
     assert "the joints of MDM" in first.notes[0]
     np.save(tmp_path / "plain.npy", places.astype(np.float32))
     (plain,) = read_generated(tmp_path / "plain.npy")
-    # Sums depend on how the array lies in memory.
+    # Sums depend on the array's memory layout.
     np.testing.assert_allclose(first.turns(), plain.turns(), atol=1e-12)
     assert motion_files(tmp_path) == [tmp_path / "plain.npy", path]
 
@@ -210,7 +210,7 @@ def test_vectors_of_humanml3d_are_the_joints_that_they_were_made_of(tmp_path: Pa
     places += (roots - places[:, 0])[:, None]
     vectors = np.zeros((N_FRAMES, 263))
     vectors[:-1, 0] = np.diff(half)
-    # A step is seen from the frame that it leads to.
+    # A step is given in the frame that it leads to.
     vectors[:-1, 1:3] = back[1:].apply(np.diff(roots, axis=0))[:, [0, 2]]
     vectors[:, 3] = roots[:, 1]
     level = roots * [1.0, 0.0, 1.0]

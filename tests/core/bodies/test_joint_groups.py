@@ -1,4 +1,4 @@
-"""Which faces lie about a joint, and what that leaves out of the check."""
+"""Faces around a joint, and the pairs that the joint exclusion leaves out."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_the_faces_about_joints_are_those_of_the_text(scale: float) -> None:
     body = rigged_body(scale)
     found = sorted(map(sorted, groups_of(body).values()))
     assert found == sorted(map(sorted, by_the_text(body)))
-    # The elbow's are those of the arm's tube, of radius 0.045, within twice that of it.
+    # The elbow's faces are those of the arm's tube, radius 0.045, within twice that radius.
     rig, elbow = body.rig, groups_of(body)["LeftForeArm"]
     assert rig is not None
     place = rig.rest[rig.joint_names.index("LeftForeArm"), :3, 3]
@@ -68,14 +68,14 @@ def test_without_links_there_are_none() -> None:
 
 
 def test_a_twist_joint_and_joints_that_move_nothing_count_as_one_limb() -> None:
-    """The tube's middle third hangs beside its end, or all hang on joints that move nothing."""
+    """The tube's middle third is a sibling of its end, or all are children of unused joints."""
     tube = rigged_tube(3)
     rig = tube.rig
     assert rig is not None
     plain = groups_of(tube)
     assert set(plain) == {"link 1", "link 2"}
     twist = replace(tube, rig=replace(rig, parents=np.array([-1, 0, 0])))
-    # What is about the end is of the whole limb, though the middle is a twist joint beside it.
+    # The end's group covers the whole limb, although the middle is a sibling twist joint.
     assert groups_of(twist)["link 2"] >= plain["link 2"]
     doubled = replace(
         rig,
@@ -89,7 +89,7 @@ def test_a_twist_joint_and_joints_that_move_nothing_count_as_one_limb() -> None:
 
 
 def bent(body: Character, **degrees: tuple[float, float, float]) -> np.ndarray:
-    """Turn joints by Euler angles, in the axes of the character."""
+    """Turn joints by Euler angles, in the character's axes."""
     rig = body.rig
     assert rig is not None
     turns = np.stack(
@@ -121,7 +121,7 @@ def test_a_crease_is_no_collision_and_a_limb_through_the_body_is() -> None:
     assert rig is not None
     place = rig.rest[rig.joint_names.index("LeftForeArm"), :3, 3]
     away = np.linalg.norm(body.rest_vertices[body.topology.faces].mean(axis=1) - place, axis=1)
-    # Of a coarse tube, folded sharply, some of the overlap lies beyond the arm's thickness.
+    # In a coarse, sharply folded tube, some of the overlap is beyond the arm's thickness.
     crease = (away[pairs] <= 2.0 * 0.045).all(axis=1)
     found = ruled.detect(elbow)
     assert 0 < crease.sum() == found.excluded.joint == found.excluded.total
@@ -135,7 +135,7 @@ def test_a_crease_is_no_collision_and_a_limb_through_the_body_is() -> None:
         (own,) = (group.faces for group in body.groups if group.name == limb)
         through = np.isin(found.pairs, own).sum(axis=1) == 1
         assert through.sum() > 20
-    # By other rules again the lists are those of a new detector.
+    # With other rules again, the lists equal those of a new detector.
     again = ruled.with_rules(ContactRules())
     np.testing.assert_array_equal(again.detect(elbow).pairs, strict.detect(elbow).pairs)
 
@@ -147,7 +147,7 @@ def test_a_character_starts_with_the_rule_and_what_is_learned_from_it_keeps_it(
     assert model.rules.joint_exclusion
     assert model.has_joints
     assert model.detector.rules.joint_exclusion
-    # No ignored pair names a joint's group.
+    # Joint groups cannot be named in ignored pairs.
     named = {group.name for kind in model.groups_by_kind.values() for group in kind}
     assert "link 1" not in {g.name for g in model.groups_by_kind["meshes and materials"]}
     assert len(named) == sum(map(len, model.groups_by_kind.values()))
@@ -162,7 +162,7 @@ def test_a_character_starts_with_the_rule_and_what_is_learned_from_it_keeps_it(
 def test_the_real_robot_s_shells_overlap_at_joints_and_the_mannequin_s_limbs_elsewhere(
     characters: Path,
 ) -> None:
-    """Of 31 frames of each clip: see docs/results.md."""
+    """In 31 frames of each clip: see docs/results.md."""
     for name, without, then in (("xbot", 28, 8), ("mannequin", 19, 19)):
         body = RigBody.of(read_character(characters / f"{name}-moves.glb"))
         poses = body.decode(body.known_poses)
@@ -170,7 +170,7 @@ def test_the_real_robot_s_shells_overlap_at_joints_and_the_mannequin_s_limbs_els
         assert len(poses) == 31
         assert off.detector.are_colliding(poses).sum() == without
         assert body.detector.are_colliding(poses).sum() == then
-        # An arm turned down into the trunk, far from its shoulder, is a collision all the same.
+        # An arm turned down into the trunk, far from its shoulder, is still a collision.
         space, latent = body.space, np.zeros(body.latent_size)
         (arm,) = (k for k, n in enumerate(space.rig.joint_names) if n.endswith("LeftArm"))
         codes = np.flatnonzero(space.joint_of_code == arm)

@@ -1,4 +1,4 @@
-"""What joints are, by the names that usual programs give them."""
+"""Roles of joints, from the names that common programs give them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TRUNK = (Role.SPINE, Role.SPINE, Role.NECK, Role.HEAD)
 
 
 def roles_of(tree: str) -> dict[str, Role]:
-    """Tell the roles of names in lines, indented below their parents."""
+    """Return the roles of names given in lines, indented below their parents."""
     lines = tree.splitlines()
     depths = [len(line) - len(line.lstrip()) for line in lines]
     parents = [
@@ -157,7 +157,7 @@ def test_the_pieces_of_a_limb_twist_and_its_other_half_is_found_below_them() -> 
     assert tuple(unreal.values()) == (Role.THIGH, Role.TWIST, Role.SHIN, Role.TWIST)
     arm = roles_of(chain("clavicle_l", "upperarm_l", "lowerarm_l", "lowerarm_twist_01_l"))
     assert tuple(arm.values()) == (Role.SHOULDER, Role.UPPER_ARM, Role.FOREARM, Role.TWIST)
-    # Where only one half has a name, what hangs on it may be the other half.
+    # If only one half has a role's name, its child may be the other half.
     assert set(roles_of(chain("Arm.L", "Arm.L.001")).values()) == {Role.UPPER_ARM}
 
 
@@ -168,7 +168,7 @@ def test_pieces_between_a_shoulder_or_a_hip_and_the_next_joint_twist() -> None:
     )  # fmt: skip
     leg = roles_of(chain("Root_M", "Hip_L", "HipPart1_L", "Knee_L"))
     assert tuple(leg.values()) == (Role.OTHER, Role.THIGH, Role.TWIST, Role.SHIN)
-    # A hip in the middle is none of a leg.
+    # A hip in the middle does not belong to a leg.
     assert roles_of(chain("hip", "knee_l"))["hip"] is Role.OTHER
 
 
@@ -201,7 +201,7 @@ def test_a_joint_that_repeats_its_parent_does_not_turn() -> None:
     )  # fmt: skip
     still = ~(np.concatenate(joint_limits(rig, roles), axis=1) != 0.0).any(axis=1)
     assert np.flatnonzero(still).tolist() == [1, 3, 6]
-    # Skin of its own is a reason to turn.
+    # A joint with its own skin can be turned.
     led = replace(rig, joint_of=np.where(joint_of == 1, 2, joint_of))
     assert (joint_limits(led, joint_roles(led))[1][3] > 0.0).any()
 

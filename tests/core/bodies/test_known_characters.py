@@ -1,4 +1,4 @@
-"""What is remembered of characters: rules, body parts and place, and what cannot be read."""
+"""Remembered characters: rules, body parts and place, and unreadable records."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def opened(path: Path) -> RigBody:
 
 
 def chosen(path: Path) -> RigBody:
-    """Choose other rules and body parts for a character, which are kept."""
+    """Choose and remember other rules and body parts for a character."""
     body = opened(path)
     mesh = body.groups[0].name
     other = body.with_rules(ContactRules(0.05, None, ((mesh, "component 1"),), 0.01))
@@ -114,7 +114,7 @@ def test_a_file_is_read_once_whatever_is_chosen_for_it(path: Path) -> None:
     assert again.space.roles[-1] is Role.SHIN
     assert open_body(again.character, 0).up_axis == 0
     assert again.character.file is body.character.file
-    # What the file says is not remembered.
+    # A choice equal to the file's is not remembered.
     remember_up(again, 1)
     assert open_body(again.character).up_axis == 1
 

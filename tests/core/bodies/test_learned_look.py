@@ -1,4 +1,4 @@
-"""A model that was learned from a character looks as that does, while its file is there."""
+"""A model learned from a character looks like it while the character's file exists."""
 
 from __future__ import annotations
 

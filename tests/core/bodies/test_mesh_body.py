@@ -1,4 +1,4 @@
-"""A mesh of a file as a body: checked as other bodies are, and refused where codes are needed."""
+"""A mesh file as a body: checked like other bodies, and refused if codes are needed."""
 
 from __future__ import annotations
 

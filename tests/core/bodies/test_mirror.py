@@ -35,7 +35,7 @@ OCTAHEDRON_FACES = np.array(
 )
 
 FREE_THAT_COLLIDES_MIRRORED = 1
-"""The sample of the box of the built-in body, of generator 0, that loses its freedom so."""
+"""The free sample of the built-in body's box, generator 0, whose mirror image collides."""
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_the_two_sides_of_a_symmetric_mesh_are_found() -> None:
     assert symmetry is not None
     assert symmetry.partner.tolist() == [1, 0, 2, 3, 4, 5]
     assert (symmetry.normal.tolist(), symmetry.offset) == ([1.0, 0.0, 0.0], 3.0)
-    # With x up, front and back of z or left and right of y are what is left to exchange.
+    # With x up, only front and back (z) or left and right (y) can be exchanged.
     across = find_symmetry(OCTAHEDRON, Topology(OCTAHEDRON_FACES, 6), up_axis=0)
     assert across is not None
     assert across.partner.tolist() == [0, 1, 3, 2, 4, 5]
@@ -81,7 +81,7 @@ def test_a_dented_mesh_has_no_two_sides() -> None:
 
 
 def test_a_body_with_something_on_one_side_has_two_sides_all_the_same(body: LearnedBody) -> None:
-    """A sword moves the middle of the bounding box, not that of the body."""
+    """A sword shifts the middle of the bounding box, but not that of the body."""
     axis = int(np.abs(find_exact(body).normal).argmax())
     sword = body.reference[:60] * 0.02 + np.eye(3)[axis] * 1.5 * body.body_size
     mesh = np.concatenate([body.reference, sword])
@@ -115,7 +115,7 @@ def test_the_image_of_a_placed_mesh_is_the_placed_image(axis: int) -> None:
 def test_a_mirror_image_lies_where_the_mirror_shows_it(
     body: LearnedBody, samples: np.ndarray
 ) -> None:
-    """Without aligning anything: the turn that encoding took out was 30 to 50 mm."""
+    """Without alignment: the rotation that encoding removed amounted to 30 to 50 mm."""
     symmetry = body.symmetry
     assert symmetry is not None
     for latent in samples[[0, 2, 3]]:
@@ -126,7 +126,7 @@ def test_a_mirror_image_lies_where_the_mirror_shows_it(
         assert distance.mean() == pytest.approx(mirrored.fit_error_mean, rel=1e-6)
         assert distance.max() == pytest.approx(mirrored.fit_error_max, rel=1e-6)
         assert distance.mean() < 0.008
-        # Even where the way back is not remembered.
+        # Even if the original is not remembered.
         again = body.mirror(mirrored.latent)
         assert not again.restored
         back = np.linalg.norm(body.decode(again.latent) - body.decode(latent), axis=1)
@@ -135,7 +135,7 @@ def test_a_mirror_image_lies_where_the_mirror_shows_it(
 
 @pytest.mark.parametrize("name", ["right side lunge", "twist right", "rest"])
 def test_mirrored_poses_are_as_near_as_unseen_ones(body: LearnedBody, name: str) -> None:
-    """In their place, where the held-out error is of poses that were turned to fit best."""
+    """Compared in place, while the held-out error is after the best rigid fit."""
     metrics = body.embedding.metrics
     assert metrics is not None
     assert metrics.held_out_mean is not None
@@ -144,7 +144,7 @@ def test_mirrored_poses_are_as_near_as_unseen_ones(body: LearnedBody, name: str)
     mirrored = body.mirror(latent)
     assert mirrored.fit_error_mean < 1.5 * metrics.held_out_mean
     assert mirrored.fit_error_max < metrics.held_out_max
-    # Mirroring did something, unless the pose has two equal sides.
+    # Mirroring changes the pose unless its sides are equal.
     moved = np.linalg.norm(body.decode(mirrored.latent) - body.decode(latent), axis=1)
     assert (moved.mean() / body.body_size > 10.0 * metrics.held_out_mean) == (name != "rest")
 
@@ -169,7 +169,7 @@ def test_mirroring_twice_gives_pose_and_place_back_to_the_bit(
     assert twice.placement is not None
     assert twice.placement.rotation.tobytes() == placement.rotation.tobytes()
     assert twice.placement.translation.tobytes() == placement.translation.tobytes()
-    # And once more the very image.
+    # A third mirroring gives the same image again.
     thrice = body.mirror(twice.latent, twice.placement, twice.source)
     assert thrice.restored
     assert thrice.latent.tobytes() == once.latent.tobytes()
@@ -192,7 +192,7 @@ def test_a_free_pose_that_collides_mirrored_is_resolved(
     assert not body.detector.detect(vertices).colliding
     symmetry = body.symmetry
     assert symmetry is not None
-    # The fit error is that of what comes back, resolved.
+    # The fit error is that of the returned, resolved pose.
     image = symmetry.image(body.decode(resolved.source.latent))
     distance = np.linalg.norm(body.decode(resolved.latent) - image, axis=1) / body.body_size
     assert resolved.fit_error_mean == pytest.approx(distance.mean(), rel=1e-6)
@@ -248,7 +248,7 @@ def test_a_model_without_two_sides_says_so(tube_model: LearnedBody) -> None:
 def test_a_learned_body_with_something_on_one_side_is_mirrored(
     body: LearnedBody, samples: np.ndarray
 ) -> None:
-    """As if its left and right were triangulated in two ways, and one shoulder wore a plate."""
+    """As if its sides had different triangulations, and one shoulder a plate."""
     plate = body.reference.copy()
     axis = int(np.abs(find_exact(body).normal).argmax())
     high = plate[:, body.up_axis] - plate[:, body.up_axis].min() > 0.75 * body.body_size

@@ -1,4 +1,4 @@
-"""Contact rules of a model: in its file, in its checks, and where a predictor depends on them."""
+"""Contact rules of a model: in its file, in its checks, and in its predictor."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_rules_that_a_predictor_depends_on_stay() -> None:
     assert body.with_rules(body.rules).has_predictor
     with pytest.raises(ModelFileError, match="trained by the contact rules that it has"):
         body.with_options(RuleOptions(rest_exclusion=0.02, tolerated_depth=0.01))
-    # What is tolerated is the exact check's alone, and not kept.
+    # Tolerated depths affect only the exact check, and are not stored.
     tolerant = body.with_options(
         RuleOptions(tolerated_depth=0.01, tolerated_pairs=("head:head=0",))
     )

@@ -1,4 +1,4 @@
-"""Which models came with the program."""
+"""Recognition of the bundled models."""
 
 from __future__ import annotations
 

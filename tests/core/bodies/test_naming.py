@@ -1,4 +1,4 @@
-"""What domains are called and coloured, and where models are found by name."""
+"""Names and colours of domains, and finding models by name."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from lcollision_core.files import require_writable
 
 
 def _names(shares: list[dict[str, float]], levels: list[float] | None = None) -> tuple[str, ...]:
-    """Name domains whose squared weights on the parts are given, each part being one vertex."""
+    """Name domains with the given squared weights on parts of one vertex each."""
     parts = sorted({part for share in shares for part in share})
     mask = np.sqrt([[share.get(part, 0.0) for part in parts] for share in shares])
     heights = np.arange(len(parts), dtype=float) if levels is None else np.array(levels)
@@ -116,7 +116,7 @@ def test_both_sides_of_a_part_are_named_as_one() -> None:
 
 
 def test_names_are_short_and_different_whatever_the_labels() -> None:
-    """Long ones are cut, and those that are still equal numbered."""
+    """Long names are truncated, and then equal ones are numbered."""
     long = "the skin over the third of the thoracic vertebrae, seen from behind "
     labels = np.array([long + "left", long + "right", "upper tail", "tail", " tail "])
     names = names_from_labels(np.eye(5), labels, np.arange(5.0))
@@ -131,7 +131,7 @@ def test_no_weight_at_all_still_gives_names() -> None:
     assert len(set(names_from_labels(np.zeros((2, 3)), np.array(["a", "b", "c"]), np.ones(3)))) == 2
 
 
-# Machado et al. 2009, severity 1, on linear RGB: full, red-blind and green-blind sight.
+# Machado et al. 2009, severity 1, on linear RGB: normal, protanopic and deuteranopic vision.
 _SIGHTS = [
     np.eye(3),
     np.array(
@@ -171,7 +171,7 @@ def test_each_domain_has_a_colour_of_its_own(n_domains: int) -> None:
 
 
 def test_domains_that_meet_differ_in_hue() -> None:
-    # A chain, whose neighbours share a vertex in the palette's own order.
+    # A chain whose neighbours share a vertex, in the palette's own order.
     n_domains = 12
     mask = np.eye(n_domains) + np.eye(n_domains, k=1) + np.eye(n_domains, k=-1)
     colours = domain_colours(mask)
@@ -227,7 +227,7 @@ def test_an_unfinished_training_says_how_to_go_on(folder: Path, tmp_path: Path) 
             ModelFileError, match=rf"is not finished; .* from {re.escape(str(checkpoint))}$"
         ):
             find_model(named)
-    # A model that is trained further can be used meanwhile.
+    # A model can be used while it is trained further.
     (folder / "dancer.safetensors").touch()
     assert find_model("dancer") == folder / "dancer.safetensors"
 

@@ -1,4 +1,4 @@
-"""Files of latent poses: what comes back, and what is refused."""
+"""Files of latent poses: round trips and refusals."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_poses_of_another_model_are_refused(model: LearnedBody, path: Path) -> N
 def test_poses_of_another_model_name_it_and_never_its_fingerprint(
     model: LearnedBody, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the latent space, whatever it is called now; damaged models nearby do not matter."""
+    """Recognised by the latent space, under any name; damaged models nearby do not matter."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     folder = user_models_folder()
     folder.mkdir(parents=True)
@@ -155,7 +155,7 @@ def test_the_working_pose_is_apart_from_the_poses_and_lost_to_no_command(
     names = [first.name, tagged.name, f"{first.name} 2"]
     assert [pose.name for pose in read_poses(path, model)] == names
     assert _same(replace(read_poses(path, model)[2], name=first.name), changed)
-    # One that is among the poses to the bit is no further pose.
+    # A working pose identical to one of the poses is not a further pose.
     write_poses(path, model, [first], replace(first, name="other"))
     assert [pose.name for pose in read_poses(path, model)] == [first.name]
 
@@ -183,7 +183,7 @@ def test_pins_that_no_file_holds_are_not_written(model: LearnedBody, path: Path)
 
 
 def _broken(document: Any, n_vertices: int) -> list[tuple[str, Any]]:
-    """Return documents that must be refused, each with what the sentence says."""
+    """Return documents that must be refused, each with text from the sentence."""
     first, second = document["poses"][:2]
     turned = second["placement"]["rotation"]
 
@@ -350,7 +350,7 @@ def test_any_files_name_makes_a_poses_name(model: LearnedBody, tmp_path: Path) -
 def test_of_two_characters_of_one_name_it_is_said_what_differs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As of two exports of one character, of which poses of one do not fit the other."""
+    """For example two exports of one character, whose poses do not fit each other."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     body, poses = rigged_body(), tmp_path / "poses.json"
     model = RigBody.of(replace(body, name="ely"))
@@ -368,7 +368,7 @@ def test_of_two_characters_of_one_name_it_is_said_what_differs(
         OtherModelError, match="has as many vertices, but its joints differ in rest"
     ):
         read_poses(poses, moved)
-    # Where the file of the other is known, it is named.
+    # If the other's file is known, it is named.
     file = write_gltf(body, tmp_path / "ely.glb")
     known = open_body(file)
     assert isinstance(known, RigBody)

@@ -1,4 +1,4 @@
-"""Poses of the kinds that people make, and what a predictor says of them."""
+"""Realistic kinds of poses, and a predictor's estimates for them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_each_part_is_of_one_known_pose(draws: PoseDraws) -> None:
 
 
 def test_frames_go_from_one_known_pose_to_another(draws: PoseDraws) -> None:
-    """With t = 0 a frame is the second of its four poses."""
+    """At t = 0, a frame equals the second of its four poses."""
     numbers = iter([np.array([[0.0, 0.4, 0.9, 0.9]]), np.array([[0.0]])])
     assert np.array_equal(draws.between(1, lambda _: next(numbers)), KNOWN[[1]])
     frames = draws.between(500, np.random.default_rng(2).random)

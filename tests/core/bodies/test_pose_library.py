@@ -35,7 +35,7 @@ def pose(model: LearnedBody, name: str, value: float = 0.0) -> NamedPose:
 
 
 def make(library: PoseLibrary, *changes: LibraryChange) -> None:
-    """Make changes and write them, telling of what goes wrong as an editor does."""
+    """Make changes and write them, reporting errors as an editor does."""
     library.change(changes)
     try:
         library.take(library.writing()())
@@ -103,7 +103,7 @@ def test_two_editors_at_once_lose_nothing(
     assert one.refresh()
     assert not one.refresh()
     assert names(one) == names(two)
-    # What one has changed, the other neither removes nor replaces unseen.
+    # A pose changed by one program is neither removed nor replaced unseen by the other.
     a = one.poses[0]
     make(one, LibraryChange(a, replace(a, latent=a.latent + 5.0), 0))
     make(two, LibraryChange(two.poses[0], None, 0))
@@ -118,7 +118,7 @@ def test_two_editors_at_once_lose_nothing(
         "new": 3.0,
         "new 2": 4.0,
     }
-    # Taking one's own addition back takes nothing of the other's.
+    # Undoing one's own addition removes nothing of the other program's.
     make(one, LibraryChange(None, first, 2).inverse)
     assert names(one) == ["a", "b", "new 2"]
     assert told == []
@@ -155,7 +155,7 @@ def test_a_damaged_library_is_told_of_and_set_aside(
         assert f"was damaged and has been set aside as {aside}" in str(told[-1])
         add(opened, pose(model, "b"))
         assert names(PoseLibrary(model, tmp_path, told.append)) == ["b"]
-    # One that knows what was there before the damage writes that again.
+    # A library that was read before the damage writes its poses again.
     library.path.write_text(content)
     add(library, pose(model, "c"))
     assert names(PoseLibrary(model, tmp_path, told.append)) == ["a", "c"]

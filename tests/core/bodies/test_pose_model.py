@@ -94,7 +94,7 @@ def test_a_decoded_mesh_that_was_moved_gives_its_code_back(model: LearnedBody) -
 def test_a_rigid_motion_changes_the_placement_and_not_the_code(model: LearnedBody) -> None:
     rng = np.random.default_rng(4)
     foreign = model.decode(_box(model, 1)[0])
-    # Out of the latent space's reach, so that the fit has something to weigh.
+    # Outside the latent space, so that the fit has to compromise.
     foreign = foreign + rng.normal(0.0, 0.002 * LENGTH_IN_FILES, foreign.shape)
     still = model.encode(foreign)
     assert 1e-3 < still.fit_error_mean < 5e-3
@@ -118,7 +118,7 @@ def test_fit_error_is_the_distance_from_the_mesh_in_heights(model: LearnedBody) 
 
 
 def test_fitted_code_is_a_minimum(model: LearnedBody) -> None:
-    """No small step of a single code brings a foreign mesh clearly nearer."""
+    """No small change of a single code fits a foreign mesh noticeably better."""
     rng = np.random.default_rng(9)
     mesh = model.decode(_box(model, 1)[0])
     mesh = mesh + rng.normal(0.0, 0.002 * LENGTH_IN_FILES, mesh.shape)
@@ -167,7 +167,7 @@ def test_latent_space_names_every_code_and_straddles_zero(model: LearnedBody) ->
     assert space.groups[1].full_name(2) == f"{model.domain_names[0]}, motion 3"
     assert (space.low < 0).all()
     assert (space.high > 0).all()
-    # Divided by 1.2, the box's ends may round to within its own training codes.
+    # Divided by 1.2, the box's limits may be rounded to within the training codes.
     assert (1.2 * model.known_poses >= space.low).all()
     assert (1.2 * model.known_poses <= space.high).all()
     sampled = _box(model, 2000)
@@ -347,7 +347,7 @@ def test_embeddings_that_do_not_fit_are_refused(path: Path) -> None:
     for name, array in embedding.arrays.items():
         lacking = {key: value for key, value in embedding.arrays.items() if key != name}
         shorter = {**embedding.arrays, name: array[:-1]}
-        # A face less is another sound mesh.
+        # With a face less, the mesh is still valid.
         for arrays in [lacking] if name == "faces" else [lacking, shorter]:
             write_model_file(path, {**sections, "embedding": Section(arrays, embedding.metadata)})
             with pytest.raises(ModelFileError, match=f"^{path} is unusable"):
@@ -385,7 +385,7 @@ def test_sampled_poses_are_of_the_kind_asked_for(model: LearnedBody, colliding: 
     assert 0.05 < share < 0.95
     latent = sample_poses(model, 30, seed=3, colliding=colliding)
     for row in latent:
-        # The plain check of one exported mesh, not the batch that the sampling used.
+        # A separate check of each exported mesh, not the batch check of the sampling.
         found = model.detector.detect(model.decode(row).astype(np.float32))
         assert found.colliding == colliding
     assert np.array_equal(latent[:20], sample_poses(model, 20, seed=3, colliding=colliding))
@@ -396,7 +396,7 @@ def test_sampling_gives_up_in_a_sentence(
     model: LearnedBody, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lcollision_core.bodies.judging._MOST_MISSES", 128)
-    # Poses this near to the mean one are all free.
+    # Poses this near to the mean are all free.
     box = model.embedding.box
     calm = replace(model.embedding, box=LatentBox(0.01 * box.low, 0.01 * box.high))
     calm_model = LearnedBody("calm", calm, model.card)

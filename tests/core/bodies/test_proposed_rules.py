@@ -1,4 +1,4 @@
-"""Contact rules that a character's own poses propose."""
+"""Contact rules proposed from a character's own poses."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from tests.rigged_shapes import head_in_torso, rigged_body, sunk_arm
 
 
 def armoured(n_frames: int = 12) -> Character:
-    """Return the body with a breastplate round its trunk, and bracers that cut into its forearms.
+    """Return the body with a breastplate around its trunk, and bracers that penetrate its forearms.
 
-    Of the plates, the trunk's stands off by a quarter of its radius, and moves with it.
+    The breastplate is a quarter of the trunk's radius away from it, and moves with it.
     """
     body = rigged_body(n_frames=n_frames)
     rig = body.rig
@@ -82,7 +82,7 @@ def with_turned(body: RigBody, joint: str, axis: int, angle: float) -> np.ndarra
 
 def test_plates_that_always_touch_are_left_out_and_an_arm_in_the_breastplate_is_not() -> None:
     body = RigBody.of(armoured())
-    # As of a file whose rest pose does not show what touches.
+    # As for a file whose rest pose does not show the contacts.
     body = body.with_rules(ContactRules(joint_exclusion=True))
     poses = typical_poses(body)
     proposed = propose_rules(body)
@@ -93,7 +93,7 @@ def test_plates_that_always_touch_are_left_out_and_an_arm_in_the_breastplate_is_
     assert proposed.n_colliding_then < 0.5 * len(poses)
     other = body.with_rules(proposed.rules)
     assert other.detector.are_colliding(poses).sum() == proposed.n_colliding_then
-    # Arms and their plates; the list says so, and both sides alike.
+    # Arms and their plates, on both sides alike; the list names them.
     arms = faces_of(body, "LeftArm", "RightArm", "left bracer", "right bracer")
     assert np.isin(np.array(proposed.new), arms).all()
     assert sum(proposed.places.values()) == len(proposed.new)
@@ -106,12 +106,12 @@ def test_plates_that_always_touch_are_left_out_and_an_arm_in_the_breastplate_is_
         found = other.detector.detect(other.decode(with_turned(other, "LeftArm", 1, angle)))
         assert (np.isin(found.pairs, breastplate).sum(axis=1) == 1).sum() > 10
         assert not np.isin(found.excluded_pairs[found.excluded_rule == TOUCHING], breastplate).any()
-    # Once they apply there is nothing more to propose.
+    # Once the rules apply, there is nothing more to propose.
     assert propose_rules(other) is None
 
 
 def test_what_touches_on_one_side_is_left_out_on_the_other_too() -> None:
-    """Only the left bracer cuts in; the right one stands off, as far as it may."""
+    """Only the left bracer penetrates; the right one is as far away as allowed."""
     character = armoured()
     rig = character.rig
     assert rig is not None
@@ -134,7 +134,7 @@ def test_what_touches_on_one_side_is_left_out_on_the_other_too() -> None:
 def test_pieces_that_stand_in_each_other_are_proposed_where_they_do(n_frames: int) -> None:
     body = RigBody.of(head_in_torso(n_frames)).with_rules(ContactRules())
     poses = typical_poses(body)
-    # The frames of its clip, else random ones.
+    # The frames of its clip, otherwise random poses.
     assert len(poses) == (n_frames or 40)
     assert len(np.unique(poses, axis=0)) == len(poses)
     proposed = propose_rules(body)
@@ -148,7 +148,7 @@ def test_pieces_that_stand_in_each_other_are_proposed_where_they_do(n_frames: in
 
 
 def test_a_place_that_all_frames_of_a_short_clip_share_is_proposed_by_the_own_rules() -> None:
-    """No frame becomes free by it, as other limbs cross by turns elsewhere."""
+    """It frees no frame, as other limbs cross alternately elsewhere."""
     body = RigBody.of(sunk_arm())
     assert body.rules.joint_exclusion
     assert body.rules.rest_exclusion > 0.0
@@ -157,13 +157,13 @@ def test_a_place_that_all_frames_of_a_short_clip_share_is_proposed_by_the_own_ru
     assert (proposed.n_poses, proposed.n_colliding) == (10, 10)
     assert proposed.n_colliding_then == 10
     assert ("Hips", "LeftArm") in proposed.places
-    # Unasked, only rules that free poses apply.
+    # Rules are only offered unasked if they free poses.
     assert propose_rules(body, unasked=True) is None
 
 
 def test_nothing_is_proposed_where_most_poses_are_free() -> None:
     assert propose_rules(RigBody.of(rigged_body(n_frames=12))) is None
-    # What touches at rest does not count by the rules that a character starts with.
+    # By a character's default rules, pairs that touch at rest do not count.
     assert propose_rules(RigBody.of(head_in_torso(12))) is None
 
 

@@ -24,11 +24,11 @@ from tests.rigged_shapes import FloatArray, rigged_body, write_gltf
 
 IN_CM = 100.0
 TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""From the body's axes, z up and facing -y, to those of most BVH files."""
+"""Rotation from the body's axes, z up and facing -y, to those of most BVH files."""
 
 
 def of_rig(body: RigBody, codes: FloatArray, fps: float = 30.0) -> str:
-    """Write a motion of a body as its own skeleton's, in centimetres and with y up."""
+    """Write a motion of a body on its own skeleton, in centimetres, y up."""
     space = body.space
     rig, transforms = space.rig, np.array([space.transforms(row) for row in codes])
     # Its left is x, its up y, its front z.
@@ -81,7 +81,7 @@ FOREIGN = {
         )
     },
 }
-"""Name, parent and offset of a skeleton of motion capture whose arms hang at rest."""
+"""Name, parent and offset of a motion capture skeleton whose arms hang at rest."""
 
 
 def foreign(path: Path, turns: FloatArray, roots: FloatArray) -> Bvh:
@@ -132,7 +132,7 @@ def test_limbs_point_as_those_of_another_skeleton_do(tmp_path: Path) -> None:
             own /= np.linalg.norm(own, axis=1, keepdims=True)
             theirs /= np.linalg.norm(theirs, axis=1, keepdims=True)
             np.testing.assert_allclose(own, theirs, atol=1e-6)
-    # At rest it stands as before, its arms down, and its way is as many legs long.
+    # At rest it stands as before, arms down, and its path is equally long in leg lengths.
     hips = transforms[:, ours.index("Hips"), :3, 3] @ TO_Y_UP.T
     feet = transforms[0, ours.index("LeftFoot"), :3, 3] @ TO_Y_UP.T
     np.testing.assert_allclose(hips[0] - feet, [-0.12, 0.9, 0.0], atol=1e-6)
@@ -161,10 +161,10 @@ def test_what_was_resolved_goes_back_into_the_file_and_all_else_stays(tmp_path: 
     inside = {frame for span in found.spans for frame in span}
     assert changed
     assert changed <= inside
-    # Angles go on from those of before: no turn of 360 degrees.
+    # Angles continue from the previous ones, without jumps of 360 degrees.
     old, new = read_bvh(path).numbers, read_bvh(out).numbers
     assert np.abs(new - old).max() < 90.0
-    # A free motion comes back byte by byte.
+    # A free motion is written unchanged, byte for byte.
     write_clips(out, body, path, [MotionChange(source, source, ())])
     assert out.read_bytes() == path.read_bytes()
 
@@ -176,7 +176,7 @@ def test_a_file_of_any_encoding_and_line_ends_is_read_and_written_in_them(
     body, motion = swinging()
     text = of_rig(body, motion.codes).replace("\n", "\r\n")
     root = "頭" if encoding == "shift-jis" else "Tête"
-    # Joints whose names are as the words of the format.
+    # Joint names that equal keywords of the format.
     text = re.sub(r"JOINT (?!Left|Right)\S+", "JOINT MOTION_root", text, count=1)
     text = re.sub(r"ROOT \S+", f"ROOT LOCOMOTION {root}", text)
     path = tmp_path / "motion.bvh"
@@ -273,7 +273,7 @@ def test_a_vrm_animation_of_a_real_character_is_the_clip(characters: Path, tmp_p
     (expected,) = read_motions(body, source)
     (motion,) = read_motions(body, as_vrma(source, tmp_path / "moves.vrma", bones))
     difference = body.decode(motion.codes[::10]) - body.decode(expected.codes[::10])
-    # Fingers and toes are not among its bones.
+    # Fingers and toes are not among the VRM bones.
     assert np.median(np.abs(difference)) < 1e-6 * body.body_size
 
 

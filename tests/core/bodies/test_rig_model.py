@@ -1,4 +1,4 @@
-"""A character posed by its rig, as a body: names, drags, Resolve, mirroring, encoding, files."""
+"""A rigged character as a body: names, drags, Resolve, mirroring, encoding, files."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_its_codes_have_names(model: RigBody) -> None:
     assert names["LeftArm", 0] == names["RightUpLeg", 0] == "forward"
     assert {names["LeftArm", 2], names["RightArm", 2]} == {"up", "down"}
     assert {names["LeftUpLeg", 2], names["RightUpLeg", 2]} == {"in", "out"}
-    # The neck, which leads no vertex, is part of the spine.
+    # The neck, which has no vertices of its own, is part of the spine.
     assert (names["Spine", 0], names["Neck", 0]) == ("spine forward", "neck forward")
     effects = dict(zip(names, model.code_effects[6:], strict=True))
     assert model.domain_names[effects["LeftForeArm", 0].domain] == "Left forearm"
@@ -107,14 +107,14 @@ def test_limits_are_kept_and_reset_is_the_rest_pose(model: RigBody) -> None:
     assert (space.high > 0.0).all()
     bend = code_of(model, "LeftForeArm", 0)
     assert np.degrees(space.high[bend]) >= 150.0
-    # A drag may go further than a person; a random pose does not.
+    # A drag may exceed human limits; a random pose does not.
     poses = model.sample(200, np.random.default_rng(0))
     assert ((space.low <= poses) & (poses <= space.high)).all()
     assert 80.0 < np.degrees(poses[:, bend].max()) <= 135.0
     decoded = model.decode(poses)
     assert np.isfinite(decoded).all()
     np.testing.assert_array_equal(decoded, model.decode(poses, n_threads=1))
-    # Random poses leave the body in its place.
+    # Random poses do not move the body as a whole.
     assert not poses[:, :6].any()
     assert (np.ptp(poses[:, 6:], axis=0) > 0.0).mean() > 0.7
 
@@ -142,7 +142,7 @@ def test_a_body_part_without_codes_of_its_own_can_be_locked_and_twisted(model: R
     dragger.begin(
         np.zeros(model.latent_size), Twist(hips), (), DragOptions(solid=False, standing=False)
     )
-    # The last target is gone on to until it is reached, as in the window.
+    # The last target is repeated until it is reached, as in the window.
     for angle in (*np.linspace(0.0, 0.4, 12)[1:], *[0.4] * 10):
         step = dragger.move([angle])
     assert step.miss < 0.05
@@ -168,10 +168,10 @@ def test_a_hand_is_dragged_while_the_feet_stay(model: RigBody) -> None:
 
 
 def assert_resolved(model: RigBody, poses: FloatArray) -> set[Step]:
-    """Resolve colliding poses, and judge them by code that shares nothing with ours."""
+    """Resolve colliding poses, and judge the results by independent code."""
     faces = model.faces.astype(np.int64)
     touching = crossing_pairs(model.reference, faces)
-    # Without depths no pair is tolerated; by the rules none is anyway.
+    # The check has no depths, so no pair may be tolerated; these rules tolerate none.
     assert model.rules.tolerated_depth == 0.0
     named: dict[str, set[int]] = {}
     for group in without_joints(model.groups):
@@ -213,7 +213,7 @@ def test_colliding_poses_of_a_real_character_are_resolved(characters: Path, name
     assert isinstance(body, RigBody)
     n_poses = int(os.environ.get("LCOLLISION_POSES", "1"))
     assert_resolved(body, sample_poses(body, n_poses, seed=1, colliding=True))
-    # Most frames of their clips are free, or collide for more than being made of shells.
+    # Most frames of their clips are free, or collide not only because of shells.
     assert propose_rules(body) is None
 
 
@@ -227,7 +227,7 @@ def test_a_motion_is_resolved_frame_by_frame(model: RigBody) -> None:
     results = model.resolver.resolve_many(frames, workers=1, sequence=True)
     assert all(result.exactly_free for result in results)
     assert [result.step == Step.UNCHANGED for result in results] == (~colliding).tolist()
-    # The pose of the frame before is known to be free, whatever else is.
+    # The previous frame's pose is known to be free.
     after = alone.resolve(target, before=frames[int(colliding.argmax()) - 1])
     assert (after.exactly_free, after.step) == (True, Step.TOWARDS)
 
@@ -261,7 +261,7 @@ def test_mirroring_exchanges_the_sides(model: RigBody) -> None:
 
 
 def with_joint(name: str, parent: str, place: tuple[float, float, float]) -> RigBody:
-    """Return the body with one more joint, which moves the end of its parent's skin."""
+    """Return the body with an additional joint that moves the end of its parent's skin."""
     body = rigged_body()
     rig = body.rig
     assert rig is not None
@@ -326,7 +326,7 @@ def hanging_arm() -> Character:
 
 
 def test_joints_without_names_are_paired_by_what_they_are() -> None:
-    """Where the rest pose is not symmetric, places do not tell."""
+    """In an asymmetric rest pose, positions do not pair them."""
     hanging = hanging_arm()
     rig = hanging.rig
     assert rig is not None
@@ -340,7 +340,7 @@ def test_joints_without_names_are_paired_by_what_they_are() -> None:
 
 
 def test_an_arm_that_hangs_at_rest_is_mirrored_to_one_that_is_stretched_out() -> None:
-    """What is posed is mirrored, not the turn from a rest pose that has no two sides."""
+    """The posed mesh is mirrored, not the rotations from an asymmetric rest pose."""
     model = RigBody.of(hanging_arm())
     rig = model.space.rig
     posed = np.zeros(model.latent_size)
@@ -418,7 +418,7 @@ def test_frames_are_spread_over_clips_of_any_length(tmp_path: Path) -> None:
     assert 290 <= len(body.card.pose_names) <= 301
     rate = _frame_rate(body.character)
     assert rate == pytest.approx(297 / 603)
-    # The last frame of the longest clip is among them, and that its vertices were not made.
+    # The last frame of the longest clip is among them, although its vertices were not computed.
     assert body.card.pose_names[-1] == "dance 295"
     bend = body.known_poses[-1]
     assert np.abs(bend).max() == pytest.approx(1.0, abs=0.1)
@@ -456,7 +456,7 @@ def test_below_a_parts_name_its_codes_do_not_repeat_it() -> None:
     names = hand.code_names[codes]
     assert [name for name in names if "hand" in name or "left" in name] == []
     assert {"thumb 1 bend", "thumb 1 sideways", "index 1 bend"} < set(names)
-    # What a number alone tells apart keeps it, and so does a name in any letters.
+    # Names that differ only by a number keep it, and non-Latin names are kept.
     tail = tube_of("Hips", "Tail", "Tail2", "Schw\u00e4nzchen\u5c3e", "Tail3")
     labels = {name.rsplit(" ", 1)[0] for name in tail.code_names[6:]}
     assert labels == {"tail", "tail 2", "schw\u00e4nzchen\u5c3e", "tail 3"}
@@ -488,7 +488,7 @@ def test_general_words_find_the_codes_of_their_region(model: RigBody) -> None:
         assert all(joint.startswith(side) for joint in joints)
     assert found(model, "spine") >= {"Spine"}
     assert found(model, "elbow") == {"LeftForeArm", "RightForeArm"}
-    # A hand without fingers is found by them.
+    # A hand without fingers is also found by a search for fingers.
     assert found(model, "finger") == found(model, "hand")
 
 

@@ -1,4 +1,4 @@
-"""The rig as a space of poses: skinning, derivatives, transforms, metrics, and drags on it."""
+"""The rig as a pose space: skinning, derivatives, transforms, metrics and drags."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def random_codes(space: RigPoseSpace, seed: int = 0, share: float = 0.8) -> Floa
 
 
 def a_few(character: Character, n: int, seed: int) -> FloatArray:
-    """Return (n, V, 3) derivatives that are zero at most vertices, as those of patches are."""
+    """Return (n, V, 3) derivatives that are zero at most vertices, like those of patches."""
     generator = np.random.default_rng(seed)
     by_vertices = generator.normal(size=(n, len(character.rest_vertices), 3))
     by_vertices[generator.random(by_vertices.shape[:2]) < 0.8] = 0.0
@@ -42,7 +42,7 @@ def a_few(character: Character, n: int, seed: int) -> FloatArray:
 
 
 def unevenly_scaled() -> Character:
-    """Return the body as it is where what is above each joint is scaled unevenly at rest."""
+    """Return the body with non-uniform scales above each joint at rest."""
     body = rigged_body()
     halves = 0.2 * np.random.default_rng(5).normal(size=(len(rig_of(body).parents), 3, 3))
     stretch = np.eye(3) + halves @ np.swapaxes(halves, 1, 2)
@@ -104,7 +104,7 @@ def test_no_pose_is_decoded_to_none() -> None:
 
 
 def test_joints_stay_together(character: Character) -> None:
-    """A joint's place is where its parent has it, whatever the codes."""
+    """A joint stays attached to its parent, whatever the codes."""
     space, rig = RigPoseSpace(character), rig_of(character)
     transforms = space.transforms(random_codes(space))
     for joint, parent in enumerate(rig.parents):
@@ -166,7 +166,7 @@ def test_codes_come_back_from_their_transforms(character: Character) -> None:
     space = RigPoseSpace(character)
     codes = np.stack([random_codes(space, seed, 0.9) for seed in range(4)])
     transforms = np.stack([space.transforms(one) for one in codes])
-    # Rotation vectors are told apart up to half a turn only.
+    # Rotation vectors are unique only up to half a turn.
     back = space.codes_of_transforms(transforms)
     again = np.stack([space.transforms(one) for one in back])
     np.testing.assert_allclose(again, transforms, atol=1e-9 * space.body_size)
@@ -227,7 +227,7 @@ def test_body_parts_own_the_codes_of_their_joints() -> None:
     assert "Left forearm" in RigPoseSpace(character).part_names
     space = RigPoseSpace(character, parts)
     assert "LeftHand" not in space.part_names
-    # The neck leads no vertex.
+    # The neck has no vertices of its own.
     assert "Neck" not in space.part_names
     forearm = space.part_names.index("LeftForeArm")
     own = space.codes_of([forearm])
@@ -310,7 +310,7 @@ def test_an_animal_faces_where_its_head_is() -> None:
     rig = replace(rig_of(tube), joint_names=("spine", "head", "hoof"))
     lying = replace(tube, rig=rig, up=np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(RigPoseSpace(lying).front, [0.0, 1.0, 0.0], atol=1e-12)
-    # One that stands has its head above.
+    # If the body stands, its head is above it, and the front is still perpendicular to up.
     assert abs(RigPoseSpace(replace(lying, up=tube.up)).front @ tube.up) < 1e-12
 
 
@@ -327,7 +327,7 @@ def test_clips_widen_limits_and_say_what_is_plausible() -> None:
     np.testing.assert_allclose(
         measured.decode(codes), frames.vertices / measured.body_size, atol=1e-9
     )
-    # What the clip does is more plausible than as much in a direction of its own.
+    # The clip's motion is more plausible than an equally large one in another direction.
     turn = np.zeros(len(codes[0]))
     turn[6:] = np.random.default_rng(0).permutation(codes[10, 6:])
     cost = [float(move @ measured.precision @ move) for move in (codes[10], turn)]
@@ -349,7 +349,7 @@ def test_the_metric_measures_vertices(name: str) -> None:
         ratios.append(np.sqrt(step @ space.metric @ step / squared))
     assert 0.8 < np.median(ratios) < 1.25
     assert (np.linalg.eigvalsh(space.metric) > 0.0).all()
-    # Part by part, and all of it, from the whole Jacobian.
+    # The metrics of the parts and of the whole body, from the full Jacobian.
     everything = np.arange(space.topology.n_vertices)
     parts = np.zeros((space.n_domains, len(codes), len(codes)))
     for pose in space._plausible:
@@ -379,7 +379,7 @@ def test_a_hand_is_dragged_to_the_hip_and_stays_out_of_it() -> None:
         )[4]
     )
     grip = make_grip(space, hand)
-    # Only its own component is near along the surface.
+    # Along the surface, only its own component is near.
     assert len(grip.vertices) > 3
     begin = grip.position(character.rest_vertices)
     target = np.array([0.1, -0.02, 1.1])
@@ -418,7 +418,7 @@ def test_joints_are_on_the_side_of_the_body_on_which_their_limb_leaves_the_trunk
     expected = ["left" * name.startswith("Left") + "right" * name.startswith("Right")
                 for name in names]  # fmt: skip
     assert [side.value for side in RigPoseSpace(body).sides] == expected
-    # A hand that rests on the other side is no other hand.
+    # A hand that rests on the other side is still the same hand.
     crossed = rig_of(body).rest.copy()
     hand = names.index("LeftHandEnd")
     crossed[hand, 0, 3] *= -1.0
@@ -437,7 +437,7 @@ def test_what_is_shown_besides_a_pose_goes_along_with_the_joints() -> None:
     assert np.array_equal(
         shaped.decode_some(codes[None], np.arange(9))[0], shaped.decode(codes[None])[0, :9]
     )
-    # The whole body turned: so are the bumps.
+    # If the whole body turns, so do the bumps.
     turned_codes = codes.copy()
     turned_codes[3:6] += [0.0, 0.4, 0.0]
     moved = shaped.decode(turned_codes[None])[0] - space.decode(turned_codes[None])[0]

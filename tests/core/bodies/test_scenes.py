@@ -1,4 +1,4 @@
-"""Scenes of several bodies: their poses, their rules, their file."""
+"""Scenes of several bodies: poses, rules and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Morph targets as sliders of a pose: posed, stored, mirrored, solved about and written."""
+"""Morph targets as sliders of a pose: posing, storing, mirroring, resolving and writing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _CLIP = "wave"
 
 
 def face(path: Path, weights: tuple[float, ...] = (0.0, 0.0, 0.25), vrm: bool = False) -> Path:
-    """Write the arm with three morph targets, which its clip weighs, and with an expression."""
+    """Write the arm with three morph targets, animated by its clip, and with an expression."""
     builder = arm()
     points, _ = split_corners(*tube())
     targets = [np.zeros_like(points) for _ in _NAMES]
@@ -57,7 +57,7 @@ def body(tmp_path_factory: pytest.TempPathFactory) -> RigBody:
 
 
 def _posed(body: RigBody, **shapes: float) -> np.ndarray:
-    """Return codes of a bent arm with these sliders."""
+    """Return codes of a bent arm with the given sliders."""
     codes = np.zeros(body.latent_size)
     codes[6] = 0.5
     for name, number in shapes.items():
@@ -66,7 +66,7 @@ def _posed(body: RigBody, **shapes: float) -> np.ndarray:
 
 
 def _as_file_says(body: RigBody, codes: np.ndarray, weights: list[float]) -> np.ndarray:
-    """Return the vertices that the file's own meshes, joints and weights give."""
+    """Return the vertices according to the file's meshes, joints and weights."""
     character, rig = body.character, body.space.rig
     assert character.file is not None
     scene = character.file.scene
@@ -205,7 +205,7 @@ def test_blend_shapes_of_an_fbx_are_sliders_and_weights_of_its_glb(tmp_path: Pat
     body = RigBody.of(read_character(arm_fbx(tmp_path / "arm.fbx", is_long=True)))
     assert body.shape_names == ("Longer",)
     codes, out = np.zeros(body.latent_size), tmp_path / "arm.glb"
-    codes[-1] = 0.25  # Half of it is there at rest.
+    codes[-1] = 0.25  # Half of it is already applied at rest.
     vertices = body.exported_vertices(codes, None)
     assert np.abs(vertices - body.reference).max() > 0.01 * body.body_size
     source = SourceFile(body.character.source, body)

@@ -1,4 +1,4 @@
-"""Motions of rigs as BVH files and VRM animations, read by code that shares nothing with ours."""
+"""Motions of rigs as BVH files and VRM animations, read by independent code."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ A_POSE = {
         ]
     ),
 }
-"""A person whose arms point down and aside at rest."""
+"""A person whose arms point diagonally down at rest."""
 
 
 def moving(body: RigBody) -> FloatArray:
-    """Return (T, D) codes of poses, each at another place."""
+    """Return (T, D) codes of poses at different positions."""
     space = body.space
     return np.random.default_rng(4).uniform(space.low, space.high, (N_FRAMES, len(space.low)))
 
@@ -54,7 +54,7 @@ def axes_of(body: RigBody) -> FloatArray:
 
 
 def loose(character: Character) -> Character:
-    """Let the upper body be a tree of its own."""
+    """Make the upper body a separate tree."""
     rig = character.rig
     assert rig is not None
     parents = rig.parents.copy()
@@ -98,7 +98,7 @@ def test_a_bvh_file_comes_back_as_the_motion(tmp_path: Path) -> None:
 def test_angles_go_on_from_frame_to_frame(tmp_path: Path) -> None:
     body, path = RigBody.of(rigged_body()), tmp_path / "turns.bvh"
     codes = np.zeros((40, body.latent_size))
-    # Twice round, which a rotation alone does not tell from standing still.
+    # Two full turns, which rotations alone cannot distinguish from standing still.
     codes[:, 4] = np.linspace(0.0, 4.0 * np.pi, 40)
     written(body, codes, path)
     numbers = np.array(
@@ -117,12 +117,12 @@ def test_names_that_bvh_cannot_hold_are_replaced(tmp_path: Path) -> None:
 
 
 def vrma_of(path: Path) -> tuple[dict[str, int], FloatArray, FloatArray, FloatArray]:
-    """Return what a VRM animation says, by the glTF specification.
+    """Read a VRM animation following the glTF specification.
 
     Returns
     -------
     bones : the node of each
-    rest, turns, places : (N, 3) at rest, (T, N, 3, 3) and (T, N, 3) at its keys, in the world
+    rest, turns, places : (N, 3) rest positions, (T, N, 3, 3) and (T, N, 3) at the keys, world
     """
     data = path.read_bytes()
     (length,) = struct.unpack_from("<I", data, 12)
@@ -206,7 +206,7 @@ def test_a_vrm_animation_begins_in_a_t_pose_and_points_limbs_as_the_motion_does(
             straight = [sign, 0.0, 0.0] if "Arm" in start else [0.0, -1.0, 0.0]
             if start != "Foot":
                 np.testing.assert_allclose(at_rest / np.linalg.norm(at_rest), straight, atol=1e-6)
-    # And this body moves by it as it did.
+    # Read back, the body moves as before.
     (back,) = read_motions(body, path)
     assert np.abs(body.decode(back.codes) - body.decode(codes)).max() < 1e-4 * body.body_size
 

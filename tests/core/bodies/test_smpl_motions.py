@@ -1,4 +1,4 @@
-"""Motions of the SMPL family: whatever their arrays are called, posed as the equations say."""
+"""Motions of the SMPL family: under any array names, posed by the paper's equations."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ NOTHING_COUNTS = ContactRules(tolerated_depth=0.9)
 
 
 def of_file(body: RigBody, path: Path, arrays: Arrays) -> tuple[RigBody, Motion, tuple[str, ...]]:
-    """Write a motion, and read it as poses of the body in its shape."""
+    """Write a motion, and read it as poses of the body in the motion's shape."""
     np.savez(path, **arrays)
     shaped, notes = body_of_motion(body, path)
     assert isinstance(shaped, RigBody)
@@ -78,7 +78,7 @@ def test_frames_are_posed_as_the_equations_say(models: Path, tmp_path: Path, n_j
         expected = as_posed(smpl_arrays(n_joints), arrays, frame, turns[frame])
         assert np.abs(found - expected).max() < SAME
     assert read_motions(shaped, tmp_path / "walk.npz", fps=60.0)[0].rate == pytest.approx(60.0)
-    # It has the shape already.
+    # It already has the shape.
     assert body_of_motion(shaped, tmp_path / "walk.npz")[0] is shaped
 
 
@@ -87,14 +87,14 @@ def test_where_z_is_up_the_body_stands(body: RigBody, tmp_path: Path) -> None:
     lies = motion_arrays(n_frames=4, z_is_up=True)
     one, upright, _ = of_file(body, tmp_path / "y.npz", stands)
     other, turned, _ = of_file(body, tmp_path / "z.npz", lies)
-    # The file turns and shifts about the origin, and the pelvis lies elsewhere.
+    # The file rotates about the origin, which is not at the pelvis.
     moved = one.decode(upright.codes) - other.decode(turned.codes)
     assert np.ptp(moved, axis=1).max() < SAME
     assert np.abs(moved[:, 0] - moved[0, 0]).max() < SAME
 
 
 def split(arrays: Arrays, names: dict[str, slice], trans: str = "trans") -> Arrays:
-    """Return a motion with the turns of some columns under names of their own."""
+    """Return a motion with the rotations of some columns under separate names."""
     rest = {name: one for name, one in arrays.items() if name not in ("poses", "trans")}
     own = {name: arrays["poses"][:, columns].copy() for name, columns in names.items()}
     return rest | own | {trans: arrays["trans"]}
@@ -141,7 +141,7 @@ def test_what_a_motion_does_not_turn_is_still_and_said(body: RigBody, tmp_path: 
     turns[:22] = short["poses"][1].reshape(22, 3)
     expected = as_posed(smpl_arrays(), short, 1, turns)
     assert np.abs(shaped.decode(motion.codes[1]) - expected).max() < SAME
-    # Hands and all of SMPL-H, with the face of the body model still.
+    # SMPL-H's joints with hands; the body model's face does not move.
     of_smplh = motion_arrays(52, 3)
     of_smplh["poses"][:, 66:] = 0.1
     shaped, motion, notes = of_file(body, tmp_path / "smplh.npz", of_smplh)
@@ -203,7 +203,7 @@ def test_a_file_comes_back_with_some_frames_changed(
 ) -> None:
     source, out = tmp_path / "walk.npz", tmp_path / "free.npz"
     arrays = motion_arrays(n_frames=6, z_is_up=z_is_up)
-    # One turn more is the same, and stays so.
+    # An additional full turn gives the same pose, and is kept.
     first = arrays["poses"][:, 48:51] + 0.3
     arrays["poses"][:, 48:51] = first + 2.0 * np.pi * first / np.linalg.norm(first, axis=1)[:, None]
     arrays["poses"], arrays["trans"] = (arrays[name].astype(dtype) for name in ("poses", "trans"))
@@ -212,7 +212,7 @@ def test_a_file_comes_back_with_some_frames_changed(
     arrays["labels"] = np.array([{"a": 1}, None], dtype=object)
     shaped, motion, notes = of_file(body, source, arrays)
     assert "'pose_body' contradicts 'poses' and is left as it is" in notes
-    # By chance the change makes poses collide, which are not written where that counts.
+    # The change happens to make poses collide, which would not be written.
     shaped = shaped.with_rules(NOTHING_COUNTS)
     change = changed(motion, [1, 4])
     write_clips(out, shaped, source, [change])

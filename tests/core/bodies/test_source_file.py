@@ -1,4 +1,4 @@
-"""Poses in the user's own file: forms, axes, and that what is written is what is checked."""
+"""Poses in the user's own file: forms, axes, and checks of the written mesh."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ def test_a_sequence_is_one_cache_for_each_mesh_that_the_file_shows(
     joined = np.concatenate(caches, axis=1)
     np.testing.assert_array_equal(joined, stored[:, model.character.joined])
     np.testing.assert_allclose(stored, [frame.apply(pose) for pose in poses], rtol=1e-6, atol=1e-5)
-    # As many as the file's own meshes have.
+    # As many as in the file's own meshes.
     description, _ = described(model.character.source)
     counts = [
         sum(

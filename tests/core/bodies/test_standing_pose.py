@@ -1,4 +1,4 @@
-"""Skeletons whose rest pose is none: what they show is carried over all the same."""
+"""Skeletons without a standing rest pose: their motion is still transferred."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LIMBS = [
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """A motion whose joints are stored in axes of their own, (J, 3, 3) at rest."""
+    """A motion whose joints are stored in their own axes, (J, 3, 3) at rest."""
 
     names: tuple[str, ...]
     world: FloatArray
@@ -74,14 +74,14 @@ def moving(
     names: tuple[str, ...] = NAMES,
     trunk: float = 0.08,
 ) -> Stored:
-    """Return somebody who turns round while all joints move."""
+    """Return a person who turns around while all joints move."""
     n_frames = 6
     vectors = rng.normal(0.0, trunk, (n_frames, len(NAMES), 3))
     for joint, name in enumerate(NAMES):
         if name.endswith(("UpArm", "UpLeg")):
             vectors[:, joint] *= 4.0
         if name.endswith(("LowArm", "LowLeg")):
-            # Elbows bend forwards, knees backwards.
+            # Elbows bend forward, knees backward.
             bent = rng.uniform(0.2, 1.2, n_frames)
             vectors[:, joint, 0] = bent if name.endswith("Leg") else -bent
     local = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
@@ -97,7 +97,7 @@ def moving(
 
 
 def limbs_of(stored: Stored) -> FloatArray:
-    """Return the unit ways of eight bones in the world: (T, 8, 3)."""
+    """Return the (T, 8, 3) unit directions of eight bones in the world."""
     _, places = in_world(stored)
     ways = [places[:, NAMES.index(end)] - places[:, NAMES.index(start)] for *_, start, end in LIMBS]
     units = np.stack(ways, axis=1)
@@ -130,11 +130,11 @@ def test_limbs_point_as_they_are_shown_whatever_the_rest_pose(kind: str, seed: i
     ways = [places[:, ours.index(end)] - places[:, ours.index(start)] for start, end, *_ in LIMBS]
     own = np.stack(ways, axis=1)
     own /= np.linalg.norm(own, axis=2, keepdims=True)
-    # Up to a quarter turn about the axis that is up: which way a body faces at rest is not known.
+    # Up to quarter turns about the up axis: the facing direction at rest is unknown.
     quarters = (Rotation.from_euler("y", 90 * n, True).as_matrix() for n in range(4))
     off = min(np.abs(own @ quarter - limbs_of(stored)).max() for quarter in quarters)
     assert off < 1e-6
-    # It goes round as the source does, and the hips go their way.
+    # It turns like the source, and the hips follow its path.
     way = transforms[1:, ours.index("Hips"), :3, 3] - transforms[:-1, ours.index("Hips"), :3, 3]
     np.testing.assert_allclose(np.linalg.norm(way, axis=1), np.linalg.norm(way[0]), rtol=1e-6)
 

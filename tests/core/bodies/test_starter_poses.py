@@ -1,4 +1,4 @@
-"""Poses to begin with: the same of bodies that rest otherwise, on the ground, within limits."""
+"""Starter poses: the same for different rest poses, on the ground, within limits."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def numbered(joint: int, _: str) -> str:
 
 
 def places(space: RigPoseSpace, name: str) -> dict[str, FloatArray]:
-    """Return where the joints of a person are in a pose, left, up and forward of its hips."""
+    """Return a person's joint positions in a pose: left, up and forward of the hips."""
     (pose,) = (pose for pose in starter_poses(space) if pose.name == name)
     axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
     moved = space.transforms(pose.codes)[:, :3, 3] / space.body_size @ axes.T
@@ -45,7 +45,7 @@ def places(space: RigPoseSpace, name: str) -> dict[str, FloatArray]:
 
 
 def with_arms_down(degrees: float) -> Character:
-    """Return the person that rests in another pose, as one that was modelled so."""
+    """Return the person with its arms down at rest, as if modelled that way."""
     joints = dict(PERSON)
     turn = np.radians(degrees)
     for side, sign in (("L", 1.0), ("R", -1.0)):

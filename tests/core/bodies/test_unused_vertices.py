@@ -1,4 +1,4 @@
-"""Vertices that no face uses change neither what a model learns nor what it makes of a mesh."""
+"""Unused vertices affect neither the training of a model nor its encoding of a mesh."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CONFIG = EmbeddingConfig(
 
 
 def with_strays(poses: PoseSet) -> PoseSet:
-    """Put a vertex before and one after all others, elsewhere in each pose."""
+    """Add a vertex before and one after all others, at different positions in each pose."""
     n_poses, n_vertices = poses.vertices.shape[:2]
     share = np.linspace(1.0, 2.0, n_poses)[:, None, None]
     first, last = share * FAR[:1], share * FAR[1:]

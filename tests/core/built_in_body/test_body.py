@@ -27,14 +27,14 @@ from lcollision_core.files import PoseSet
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import Topology, body_size
 
-pytestmark = pytest.mark.slow  # It is made anew for developers alone; users have the bundled model.
+pytestmark = pytest.mark.slow  # Only developers build the body; users have the bundled model.
 
 MAX_COLLIDING = 5
 MIN_DIFFERENCE = 0.015
 """Mean vertex distance between any two authored poses, normalised."""
 
 MAX_ACCELERATION = {"body-swing": 0.036, "body-jump": 0.026}
-"""Of any vertex from frame to frame, normalised; a lost frame exceeds it."""
+"""Limit for any vertex from frame to frame, normalised; a lost frame exceeds it."""
 
 KINDS: tuple[BodyKind, ...] = ("body", "body-swing", "body-jump")
 
@@ -51,7 +51,7 @@ def skeleton(template: Template) -> Skeleton:
 
 @pytest.fixture(scope="module")
 def bodies(template: Template) -> dict[str, PoseSet]:
-    """All three kinds on the one template of 2161 vertices."""
+    """All three kinds on one template of 2161 vertices."""
     return {kind: make_body(kind, n_vertices=len(template.vertices)) for kind in KINDS}
 
 
@@ -116,7 +116,7 @@ def test_mesh_is_one_closed_surface_of_genus_0(poses: PoseSet, rest: np.ndarray)
     assert len(topology.unused_vertices) == 0
     a, b, c = rest[poses.faces].astype(np.float64).transpose(1, 0, 2)
     volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
-    # A person of this size weighs about as many kilograms as litres; inward faces give minus.
+    # A person has about as many litres as kilograms; inward faces would give a negative volume.
     assert 0.045 < volume < 0.085
 
 
@@ -156,7 +156,7 @@ def test_left_parts_are_on_the_left(poses: PoseSet, rest: np.ndarray) -> None:
     order = ["left foot", "left shin", "left thigh", "belly", "chest", "head"]
     heights = [z[labels == part].mean() for part in order]
     assert heights == sorted(heights)
-    # It faces -y: the toes are before the heels.
+    # It faces -y: the toes are in front of the heels.
     assert rest[labels == "left toes", 1].mean() < rest[labels == "left shin", 1].mean() - 0.05
 
 
@@ -287,7 +287,7 @@ def test_standing_feet_are_where_they_were_put(skeleton: Skeleton, turn: float) 
     )
     assert ball[2] < rest_ball[2] - 0.01
     sole = rotations[BONES.index("right foot")]
-    # The ankle has no axis along the shin, so a leaning shin leaves the foot a little turned.
+    # The ankle has no axis along the shin, so a leaning shin turns the foot a little.
     assert np.degrees(np.arccos((np.trace(sole.T @ turn_z(-5.0)) - 1) / 2)) < 12
 
 
@@ -308,7 +308,7 @@ def test_hands_stay_rigid_in_every_pose(poses: PoseSet, template: Template) -> N
     lengths = np.linalg.norm(
         poses.vertices[:, pairs[:, 0]] - poses.vertices[:, pairs[:, 1]], axis=2
     )
-    # Fingers that never move against each other cannot meet; the rest is the wrist's smoothing.
+    # Fingers without relative motion cannot collide; the rest is the wrist's smoothing.
     assert np.abs(lengths - lengths[0]).max() < 1e-3
 
 
@@ -423,8 +423,8 @@ def test_importing_the_body_loads_nothing_heavy() -> None:
 
 @pytest.mark.slow
 def test_reading_the_source_shapes_leaves_standard_output_in_its_place() -> None:
-    """As of a notebook, or of a program that has redirected it."""
-    # anny imports that module only where its own cache is empty.
+    """For example in a notebook, or in a program that has redirected it."""
+    # anny imports that module only if its cache is empty.
     code = (
         "import io, sys\n"
         "import anny\n"

@@ -1,4 +1,4 @@
-"""Pairs that are too near, against brute force over all pairs and against shapes."""
+"""Pairs that are too near, against brute force over all pairs and analytic shapes."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def body() -> Body:
 
 @pytest.fixture(scope="module")
 def poses(body: Body) -> npt.NDArray[np.float32]:
-    """Return poses as they are exported, of which some collide and some do not."""
+    """Return poses as exported, some of which collide."""
     return body.decode(body.sample(4, np.random.default_rng(3))).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class NearPairs:
-    """Pairs nearer than a clearance by brute force: how far apart they are, posed and at rest."""
+    """Pairs nearer than a clearance by brute force, with their posed and rest distances."""
 
     pairs: npt.NDArray[np.int64]
     apart: FloatArray
@@ -55,7 +55,7 @@ class NearPairs:
         return cls(near.pairs, near.depth, at_rest)
 
     def lacking(self, clearance: float) -> ReferencePairs:
-        """Return the pairs that lack more than the tolerance, and what they lack."""
+        """Return the pairs that violate the clearance beyond the tolerance, and by how much."""
         lacks = np.minimum(clearance, 0.5 * self.at_rest) - self.apart
         return ReferencePairs(self.pairs[lacks > 1e-9], lacks[lacks > 1e-9])
 
@@ -71,7 +71,7 @@ def check(
     clearance: float,
     expected: ReferencePairs | None = None,
 ) -> SelfCollisions:
-    """Compare every way to ask with brute force."""
+    """Compare every detector method with brute force."""
     near = detector.with_clearance(clearance)
     if expected is None:
         expected = NearPairs.of(detector, vertices, clearance).lacking(clearance)
@@ -118,7 +118,7 @@ def test_the_least_distance_is_that_of_brute_force(
         assert least.faces.tolist() == near.pairs[first].tolist()
         apart = np.linalg.norm(least.points[0] - least.points[1]) / size
         assert apart == pytest.approx(max(least.distance, 0.0), abs=1e-9)
-        # It is the largest clearance with which the pose is free.
+        # The least distance is the largest clearance with which the pose is free.
         if least.distance > 0.0:
             n_apart += 1
             for more, collides in ((-1e-6, False), (1e-6, True)):
@@ -158,7 +158,7 @@ def test_contact_rules_hold_with_a_clearance(
         rule = body.detector.with_rules(rules).rules_of(expected.pairs, expected.depth)
         found = detector.detect(pose)
         assert found.pairs.tolist() == expected.pairs[rule == 0].tolist()
-        # Of what does not count, what penetrates is told, as without a clearance.
+        # Excluded pairs are reported only if they penetrate, as without a clearance.
         plain = body.detector.with_rules(rules).detect(pose)
         assert found.excluded == plain.excluded
         assert plain.excluded.near <= (rule > 0).sum()
@@ -170,7 +170,7 @@ def test_contact_rules_hold_with_a_clearance(
     assert n_excluded > 0
     blind = body.detector.with_rules(ContactRules(near_exclusion=0.9))
     assert all(blind.least_distance(pose, CLEARANCE) is None for pose in poses)
-    # Rules that need lists of their own keep the clearance, in either order.
+    # Rules that need separate lists keep the clearance, in either order.
     assert body.detector.with_clearance(CLEARANCE).with_rules(rules).clearance == CLEARANCE
 
 
@@ -185,7 +185,7 @@ def test_soups_are_those_of_brute_force(seed: int, thin: bool) -> None:
         corners[:, 2] = middle + thickness * (corners[:, 2] - middle)
     corners[0] = [[-1.2] * 3, [1.2] * 3, [1.2, -1.2, 1.2]]
     mesh = soup(corners)
-    # At rest all are far from each other, except some that touch or cross.
+    # At rest all are far apart, except some that touch or cross.
     spread = 4.0 * rng.permutation(80)[:, None, None] * np.array([1.0, 0.3, 0.1])
     spread[:8] = spread[0]
     detector = CollisionDetector(mesh.topology, (corners + spread).reshape(-1, 3))
@@ -208,7 +208,7 @@ def test_more_pairs_than_fit_the_buffer_are_found() -> None:
 
 
 def blocks_apart(gap: float) -> tuple[CollisionDetector, Mesh]:
-    """Two blocks a gap from each other, and the detector by a rest pose with a gap of 1."""
+    """Two blocks with a gap, and the detector of a rest pose with a gap of 1."""
     one = box([0, 0, 0], [1, 1, 1])
 
     def with_gap(gap: float) -> Mesh:
@@ -263,7 +263,7 @@ def test_skin_may_bend_and_not_close() -> None:
         near = detector.with_clearance(clearance)
         assert not near.detect(folded(0.5 * np.pi).vertices).colliding
         assert near.detect(folded(0.999 * np.pi).vertices).colliding
-    # The same sheet, of which only the bent pose is known.
+    # The same sheet with the bent pose as the reference.
     bent = folded(0.9 * np.pi)
     unknown = CollisionDetector(bent.topology, bent.vertices)
     own_rest = unknown.with_clearance(0.05)
@@ -271,7 +271,7 @@ def test_skin_may_bend_and_not_close() -> None:
     by_skin = unknown.with_clearance(0.05, rest_is_known=False)
     found = by_skin.detect(bent.vertices)
     assert found.colliding
-    # None of them is joined by skin.
+    # None of them is joined by the surface.
     apart = np.abs(
         bent.faces[found.pairs[:, 0]].mean(axis=1) - bent.faces[found.pairs[:, 1]].mean(axis=1)
     )
@@ -308,7 +308,7 @@ def test_a_tolerated_depth_is_what_a_pair_may_lack() -> None:
         assert of_pair.least_distance(mesh.vertices, clearance) is not None
         near = detector.with_rules(rules).with_clearance(clearance)
         assert near.detect(mesh.vertices).colliding == collides
-        # What is told is the distance all the same.
+        # The reported value is still the distance.
         least = near.least_distance(mesh.vertices, clearance)
         assert least is not None
         assert least.distance * detector.body_size == pytest.approx(0.04)
@@ -329,7 +329,7 @@ def test_groups_that_may_touch_are_too_near_where_they_penetrate() -> None:
         if expected:
             deepest = found.penetration_depth.max() * detector.body_size
             assert deepest == pytest.approx(0.01)
-        # Other groups keep the clearance, and the ones that may touch keep it from others.
+        # Other groups keep the clearance, and those that may touch keep it from others.
         some = detector.with_touching([(one, one), (other[:1], one[:1])]).with_clearance(clearance)
         assert some.detect(mesh.vertices).colliding
         assert touching.with_rules(ContactRules(near_exclusion=1e-6)).may_touch
@@ -345,13 +345,13 @@ def test_a_clearance_out_of_range_is_refused(clearance: float) -> None:
 
 
 def test_two_faces_just_below_the_clearance_are_never_lost() -> None:
-    """Boxes are of less precision than distances."""
+    """Boxes have less precision than distances."""
     rng = np.random.default_rng(2)
     for _ in range(200):
         clearance = 10.0 ** rng.uniform(-7, -1)
         place, size = rng.uniform(-0.4, 0.4, 3), 10.0 ** rng.uniform(-3, -1)
         triangle = place + np.array([[0, 0, 0], [size, 0, 0], [0, size, 0]])
-        # Less than the tolerance is no collision.
+        # A violation below the tolerance is not a collision.
         gap = np.array([0.0, 0.0, clearance - 3.0 * DEPTH_TOLERANCE])
         corner = np.array([[[-0.5] * 3, [-0.5, -0.5, -0.4], [-0.4, -0.5, -0.5]]])
         mesh = soup(np.concatenate([[triangle, triangle + gap], corner, corner + 0.9]))
@@ -363,7 +363,7 @@ def test_two_faces_just_below_the_clearance_are_never_lost() -> None:
 
 
 def test_what_touches_at_rest_but_for_rounding_may_touch() -> None:
-    """Two sheets lie on each other, as a skirt on a belt, nearer than float32 has places."""
+    """Two sheets lie on each other, like a skirt on a belt, nearer than float32 resolves."""
     sheet, gap = folded(0.0), np.array([0.0, 0.0, 1e-8])
     up = sheet.vertices + [0.0, 0.0, 1.0]
     sheets = join(Mesh(up, sheet.faces), Mesh(up + gap, sheet.faces))
@@ -371,7 +371,7 @@ def test_what_touches_at_rest_but_for_rounding_may_touch() -> None:
     near = detector.with_clearance(0.001)
     exported = sheets.vertices.astype(np.float32)
     assert not near.detect(exported).colliding
-    # Sheets that cross are too near as before.
+    # Sheets that cross still count.
     crossing = exported.copy()
     crossing[: len(up), 2] += 0.1 * (exported[: len(up), 0] - 0.47)
     assert near.detect(crossing).colliding

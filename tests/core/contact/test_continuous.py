@@ -1,4 +1,4 @@
-"""Contact on the linear path between two poses, against shapes whose path is known."""
+"""Contact on the linear path between two poses, against shapes with known paths."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ APART = [3.0, 0.0, 0.0]
 
 
 def two_spheres() -> tuple[Mesh, CollisionDetector, int]:
-    """Return two unit spheres whose middles are 3 apart, and how many vertices the first has."""
+    """Return two unit spheres with centres 3 apart, and the first one's number of vertices."""
     one = sphere()
     both = join(one, one.moved(APART))
     return both, CollisionDetector(both.topology, both.vertices), len(one.vertices)
@@ -35,7 +35,7 @@ def test_a_sphere_that_passes_another_hits_it_or_not(aside: float, collides: boo
     assert not detector.detect(end).colliding
     assert detector.collide_between(start, end) == collides
     assert detector.collide_between(end, start) == collides
-    # Nothing moves, or both alike.
+    # Nothing moves, or both move equally.
     assert not detector.collide_between(start, start)
     assert not detector.collide_between(start, start + [5.0, 1.0, -3.0])
 
@@ -59,7 +59,7 @@ def test_the_verdict_is_that_of_densely_sampled_poses() -> None:
         assert detector.collide_between(start, end) >= sampled
         verdicts.append((sampled, detector.collide_between(start, end)))
     assert {one for one, _ in verdicts} == {True, False}
-    # Only what grazes may differ.
+    # Only grazing contacts may differ.
     assert sum(one != other for one, other in verdicts) <= 1
 
 
@@ -87,10 +87,10 @@ def test_faces_that_share_a_vertex_and_excluded_pairs_do_not_count() -> None:
     groups = [FaceGroup(name, np.flatnonzero(labels == k)) for k, name in enumerate("ab")]
     for rules in (ContactRules(ignored=(("a", "b"),)), ContactRules(left_out=("b",))):
         assert not detector.with_rules(rules, groups).collide_between(mesh.vertices, end)
-    # What one depth tolerates, another does not: the path asks for contact.
+    # Tolerated depths do not apply on the path.
     tolerant = detector.with_rules(ContactRules(tolerated_depth=0.5))
     assert tolerant.collide_between(mesh.vertices, end)
-    # All triangles of a tetrahedron share vertices, even where it turns inside out.
+    # All triangles of a tetrahedron share vertices, even when it turns inside out.
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     solid = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))
     assert not CollisionDetector(solid.topology, corners).collide_between(corners, -corners)
@@ -98,7 +98,7 @@ def test_faces_that_share_a_vertex_and_excluded_pairs_do_not_count() -> None:
 
 @pytest.mark.slow
 def test_what_crosses_at_first_by_an_excluded_pair_alone_does_not_matter() -> None:
-    """Two boxes stick in each other, which is ignored; a third passes both, or hits one."""
+    """Two boxes penetrate each other, which is ignored; a third passes both, or hits one."""
     stuck = join(box([0, 0, 0], [1, 1, 1]), box([0.5, 0.2, 0.2], [2, 0.8, 0.8]))
     mesh = join(stuck, box([0, 0, 3], [1, 1, 4]))
     groups = [

@@ -1,4 +1,4 @@
-"""Penetration depth of two triangles: hand-worked values and an exact reference."""
+"""Penetration depth of two triangles: values by hand and an exact reference."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.core.brute_force import are_disjoint, exact_depth, exact_depth_and_di
 from tests.core.shapes import random_rotation
 
 FLOOR = np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
-"""A triangle in the plane z = 0, large beside what it meets."""
+"""A triangle in the plane z = 0, larger than those that it meets."""
 
 
 def depth(a: object, b: object, tolerance: float = 0.0) -> float:
@@ -63,7 +63,7 @@ HAND_WORKED = {
     "an edge touches an edge across": (FLOOR, [[2, 0, 1], [2, 0, -1], [2, -1, 0]], 0.0),
     "apart beside the plane that both cross": (FLOOR, [[5, 5, -1], [5, 5, 1], [6, 5, 0]], 0.0),
     "boxes overlap, triangles do not": (FLOOR, [[3, 3, -1], [3, 3, 1], [4, 4, 0]], 0.0),
-    # Degenerate triangles are the segments and points that they look like.
+    # Degenerate triangles count as segments and points.
     "a segment stabs the floor by 0.25": (FLOOR, [[1, 1, -0.25], [1, 1, 1], [1, 1, 0.5]], 0.25),
     "a segment given as two equal corners": (FLOOR, [[1, 1, -0.25], [1, 1, 1], [1, 1, 1]], 0.25),
     "a segment lies in the floor": (FLOOR, [[0, 0, 0], [1, 1, 0], [2, 2, 0]], 0.0),
@@ -103,7 +103,7 @@ def test_hand_worked_depths_in_any_frame(name: str) -> None:
         rotation, shift = random_rotation(rng), rng.uniform(-10, 10, 3)
         first = np.asarray(a, dtype=float) @ rotation.T + shift
         second = np.asarray(b, dtype=float) @ rotation.T + shift
-        # What was exactly coplanar is now only so up to the rounding of the corners.
+        # Exactly coplanar triangles are now coplanar only up to rounding.
         assert depth(first, second) == pytest.approx(expected, abs=1e-13)
 
 
@@ -171,8 +171,8 @@ def test_a_corner_that_is_not_finite_is_named(bad: float) -> None:
 def test_long_edges_that_are_nearly_parallel(sine: float) -> None:
     """Two wedges back to back, whose ridges cross at an angle of asin(2 sine) at the depth h.
 
-    The way out is up, along the cross product of the ridges: all but rounding noise, which must
-    neither part them (a missed collision) nor hide the way.
+    The way out is up, along the cross product of the ridges: nearly rounding noise, which must
+    neither separate them (a missed collision) nor hide the way out.
     """
     rng = np.random.default_rng(int(1e12 * sine))
     missed_at_most = 0.0
@@ -187,7 +187,7 @@ def test_long_edges_that_are_nearly_parallel(sine: float) -> None:
         expected = exact_depth(a, b)
         assert 0.0 < expected <= 2 * h
         missed_at_most = max(missed_at_most, abs(depth(a, b) - expected))
-    # A dropped direction across edges of angle 1e-10 costs up to 1e-10 times the slope.
+    # Dropping a direction across edges at an angle of 1e-10 costs up to 1e-10 times the slope.
     assert missed_at_most <= (1e-11 if sine < 1e-10 else 2e-15)
 
 
@@ -198,7 +198,7 @@ def test_slivers(width: float) -> None:
     for _ in range(40):
         a = np.array([[-1.0, 0, 0], [1.0, 0, 0], [rng.uniform(-1, 1), width, 0]])
         b = rng.uniform(-1, 1, (3, 3))
-        # Pierce the sliver about its middle.
+        # Pierce the sliver near its middle.
         b -= b.mean(axis=0) - [rng.uniform(-0.5, 0.5), width * rng.uniform(0, 0.5), 0]
         rotation = random_rotation(rng)
         a, b = (a @ rotation.T)[rng.permutation(3)], b @ rotation.T
@@ -209,7 +209,7 @@ def test_slivers(width: float) -> None:
     assert n_penetrating >= 20
 
 
-# Few bits, so that touching, coplanar, parallel and degenerate cases are frequent and exact.
+# Few bits make touching, coplanar, parallel and degenerate cases frequent and exact.
 lattice_triangles = st.lists(
     st.tuples(*[st.integers(-3, 3)] * 3), min_size=3, max_size=3
 ).map(lambda corners: np.array(corners, dtype=np.float64))  # fmt: skip
@@ -238,14 +238,14 @@ def test_random_triangles_against_the_exact_reference(
     rotation = random_rotation(rng)
     a = 10**size_a * rng.uniform(-1, 1, (3, 3)) * flat @ rotation.T
     b = 10**size_b * rng.uniform(-1, 1, (3, 3)) * flat @ rotation.T
-    # Let some point of one be some point of the other, so that about all touch.
+    # Make a point of one coincide with a point of the other, so that nearly all touch.
     a += rng.dirichlet(np.ones(3)) @ b - rng.dirichlet(np.ones(3)) @ a
     size = max(np.abs(a).max(), np.abs(b).max())
     assert depth(a, b) == pytest.approx(exact_depth(a, b), abs=1e-14 * size)
 
 
 def test_the_depth_is_the_shortest_way_out() -> None:
-    """Checked by the definition, with a linear program as the judge of what is disjoint."""
+    """Checked by the definition, with a linear program deciding what is disjoint."""
     rng = np.random.default_rng(11)
     n_penetrating = 0
     while n_penetrating < 12:

@@ -91,7 +91,7 @@ def test_a_pressed_block_is_as_deep_as_it_was_pressed(relative: float) -> None:
     mesh = pressed_block(1.5 * relative)
     found = detector_for(mesh).detect(mesh.vertices)
     # The four walls of the small block cross the face of the large one: each of 8 wall
-    # triangles that reach it meets one or both of its halves.
+    # triangles that reach it meets one or both of the face's halves.
     assert set(found.pairs[:, 0]) <= {2, 3}
     assert 8 <= len(found.pairs) <= 16
     # Coordinates near 1 are rounded by 1e-16.
@@ -101,18 +101,18 @@ def test_a_pressed_block_is_as_deep_as_it_was_pressed(relative: float) -> None:
 @pytest.mark.parametrize("shift", [0.0, 10.0, 1e3, 1e6])
 def test_results_do_not_depend_on_the_frame(shift: float) -> None:
     rng = np.random.default_rng(0)
-    # Turned, so that no two faces touch exactly, which rounding could turn into either.
+    # Rotated, so that no two faces touch exactly, which rounding could decide either way.
     mesh = interlocked_tori(0.6).turned(random_rotation(rng))
     detector = detector_for(mesh)
     at_home = detector.detect(mesh.vertices)
     away = mesh.turned(random_rotation(rng)).moved(shift * detector.body_size * np.ones(3))
     found = detector.detect(away.vertices)
-    # Coordinates of `shift` body sizes are rounded by 2^-53 of them.
+    # Coordinates of `shift` body sizes have a relative rounding error of 2^-53.
     rounding = 1e-14 + 1e-15 * shift
     assert at_home.penetration_depth.min() > 1e-7
     assert np.array_equal(found.pairs, at_home.pairs)
     np.testing.assert_allclose(found.penetration_depth, at_home.penetration_depth, atol=rounding)
-    # And with a reference that moved along.
+    # Also with a reference that is moved along.
     assert np.array_equal(check_mesh(away).pairs, at_home.pairs)
     apart = interlocked_tori(0.4).turned(random_rotation(rng)).moved(shift * np.ones(3))
     assert not check_mesh(apart).colliding
@@ -199,7 +199,7 @@ def test_face_0_is_a_face(last: int) -> None:
 
 
 def test_all_of_many_pairs_are_reported() -> None:
-    # 3000 blades through one floor: many times the room that a search starts with.
+    # 3000 blades through one floor: many times the initial buffer of a search.
     rng = np.random.default_rng(8)
     feet = rng.uniform(0, 1, (3000, 2))
     depth = rng.uniform(0.001, 0.002, 3000)
@@ -216,7 +216,7 @@ def test_all_of_many_pairs_are_reported() -> None:
     np.testing.assert_allclose(
         found.penetration_depth[with_floor] * detector.body_size, depth, rtol=1e-11
     )
-    # Again, now that there is room, and a sparse pose after a crowded one.
+    # Again with the grown buffer, and a sparse pose after a crowded one.
     again = detector.detect(mesh.vertices)
     assert np.array_equal(again.pairs, found.pairs)
     assert np.array_equal(again.vertex_energy, found.vertex_energy)
@@ -247,7 +247,7 @@ def test_any_number_of_faces(n_faces: int) -> None:
 
 
 def test_faces_that_share_one_vertex_do_not_count() -> None:
-    # Two blades stand in a floor; one of them hangs on a corner of the floor.
+    # Two blades stand in a floor; one of them shares a corner with the floor.
     floor, stem, blade = [0, 1, 2], [3, 4], [5, 6, 7]
     vertices = np.array(
         [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
@@ -255,7 +255,7 @@ def test_faces_that_share_one_vertex_do_not_count() -> None:
         + [[2, 1, -1], [2, 1, 1], [3, 1, 1]],
         dtype=np.float64,
     )
-    # By depth alone the hanging blade would count.
+    # By its depth alone, the blade with the shared corner would count.
     assert exact_depth(vertices[floor], vertices[[1, *stem]]) > 0.1
     for of_floor, of_blade in itertools.product(range(3), repeat=2):
         hanging = np.roll([of_floor, *stem], of_blade)
@@ -279,7 +279,7 @@ def test_random_meshes_against_brute_force(
     faces = np.stack([rng.permutation(n_vertices)[:3] for _ in range(n_faces)]).astype(np.int32)
     vertices = rng.uniform(0, 1, (n_vertices, 3))
     if on_lattice:
-        # Coplanar, touching, degenerate and duplicate faces in plenty.
+        # Many coplanar, touching, degenerate and duplicate faces.
         vertices = rng.integers(0, 5, (n_vertices, 3)).astype(float)
         vertices[:2] = [[0, 0, 0], [4, 4, 4]]
     reference = rng.uniform(0, 1, (n_vertices, 3))
@@ -299,7 +299,7 @@ def test_crumpled_surfaces_against_brute_force(mesh: Mesh, amplitude: float) -> 
         if kind == 0:
             pose += rng.normal(scale=amplitude, size=pose.shape)
         else:
-            # Smooth folds: what a bad pose looks like.
+            # Smooth folds, as in a bad pose.
             waves = rng.normal(size=(3, 3)) * 4
             pose += 4 * amplitude * np.sin(pose @ waves)
         check_against_brute_force(detector, pose, mesh.faces)
@@ -307,7 +307,7 @@ def test_crumpled_surfaces_against_brute_force(mesh: Mesh, amplitude: float) -> 
 
 @pytest.mark.parametrize("spread", [1.0, 300.0])
 def test_no_shallow_pair_slips_between_the_boxes(spread: float) -> None:
-    """Floors touched from above and below: boxes that overlap by less than float32 resolves."""
+    """Floors touched from above and below: boxes overlap by less than float32 resolves."""
     rng = np.random.default_rng(12)
     n = 150
     floor = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
@@ -321,7 +321,7 @@ def test_no_shallow_pair_slips_between_the_boxes(spread: float) -> None:
     blades = (size * blade - lift) * np.concatenate([side**2, side**2, side], axis=2)
     triangles = np.stack([size * floor + positions, blades + positions], axis=1).reshape(-1, 3, 3)
     mesh = soup(triangles)
-    # The unit is that of a reference of body size 1, whatever the spread of the pose.
+    # The reference has body size 1, whatever the spread of the pose.
     reference = soup(triangles / spread)
     detector = detector_for(reference)
     found = detector.detect(mesh.vertices)
@@ -332,7 +332,7 @@ def test_no_shallow_pair_slips_between_the_boxes(spread: float) -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_boxes_that_only_touch_in_single_precision(axis: int, up: float) -> None:
-    # A leaf of 8 floors in one plane, a leaf of 8 blades whose tips are 1e-8 behind it.
+    # A leaf of 8 floors in one plane, and a leaf of 8 blades whose tips are 1e-8 behind it.
     positions = np.arange(8)[:, None, None] * np.array([0.03, 0.0, 0.0])
     floors = 0.02 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) + positions
     blades = np.array([[0.005, 0.005, -1e-8], [0.005, 0.005, 1], [0.006, 0.005, 1]]) + positions

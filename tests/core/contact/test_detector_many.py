@@ -1,4 +1,4 @@
-"""More pairs than a buffer holds, surfaces that coincide, vertices that no face uses."""
+"""More pairs than a buffer holds, coincident surfaces, unused vertices."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_each_face_of_a_surface_that_is_there_twice_coincides_with_its_twin(unit
 
 def test_walls_that_share_a_plane_coincide_however_they_are_cut() -> None:
     block = box([0, 0, 0], [1, 1, 1])
-    # A wall of two triangles against a wall of two: with the same diagonal, or across it.
+    # Two walls of two triangles each, with the same diagonal or with crossing ones.
     assert coincident(join(block, block.moved([1, 0, 0]))) == (2, 0)
     mirrored = Mesh(block.vertices * [1, -1, 1] + [1, 1, 0], block.faces[:, ::-1])
     assert coincident(join(block, mirrored)) == (4, 0)
@@ -92,7 +92,7 @@ def test_what_touches_in_a_line_or_a_point_does_not_coincide() -> None:
     block = box([0, 0, 0], [1, 1, 1])
     for shift in ([1, 1, 0], [1, 1, 1], [1.0001, 0, 0], [2, 0, 0]):
         assert coincident(join(block, block.moved(shift))) == (0, 0)
-    # Faces of one plane that lie side by side.
+    # Faces of one plane, side by side.
     flat = grid(4)
     assert coincident(flat) == (0, 0)
     assert coincident(join(flat, flat.moved([1, 0, 0]))) == (0, 0)

@@ -43,7 +43,7 @@ def test_scape_against_brute_force(scape: PoseSet, pose: int) -> None:
 
 
 def test_bent_scape_against_brute_force(scape: PoseSet) -> None:
-    """Wring the body about its long axis and fold it: limbs go through limbs."""
+    """Twist the body about its long axis and fold it, so that limbs penetrate limbs."""
     detector = CollisionDetector(scape.topology, scape.vertices[0])
     body = scape.vertices[20].astype(float) / detector.body_size
     bent = body + 0.08 * np.sin(body @ np.array([[9.0, 3, 7], [-5, 8, 11], [8, -9, 6]]))
@@ -71,7 +71,7 @@ def test_scape_in_another_frame_and_unit(scape: PoseSet) -> None:
 
 
 def fcl_pairs(vertices: np.ndarray, faces: np.ndarray) -> set[tuple[int, int]]:
-    """Return the pairs that FCL finds in a mesh against itself and that share no vertex."""
+    """Return the pairs without a common vertex that FCL finds in a mesh against itself."""
     fcl = pytest.importorskip("fcl")
     model = fcl.BVHModel()
     model.beginModel(len(vertices), len(faces))
@@ -89,7 +89,7 @@ def fcl_pairs(vertices: np.ndarray, faces: np.ndarray) -> set[tuple[int, int]]:
 
 
 def check_against_fcl(detector: CollisionDetector, vertices: np.ndarray, faces: np.ndarray) -> int:
-    """FCL counts touching faces too, so it may add pairs of a depth within the tolerance."""
+    """FCL counts touching faces too, so it may add pairs with depths within the tolerance."""
     ours = set(map(tuple, detector.detect(vertices).pairs.tolist()))
     theirs = fcl_pairs(vertices, faces)
     assert ours <= theirs

@@ -1,4 +1,4 @@
-"""How the detector is used: batches, threads, cancelling, odd input, imports, cached code."""
+"""Use of the detector: batches, threads, cancelling, odd input, imports, cached code."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_another_reference_changes_the_unit_alone(
     crumpled: tuple[CollisionDetector, np.ndarray],
 ) -> None:
     detector, poses = crumpled
-    # A tree that fits no pose is slow, and still right.
+    # A tree that fits no pose is slow but still correct.
     scattered = np.random.default_rng(5).uniform(0, 10, poses[0].shape)
     other = CollisionDetector(detector.topology, scattered)
     for pose in poses[::5]:
@@ -96,7 +96,7 @@ def test_what_collides_where_the_last_did_is_known_without_a_search(
     with monkeypatch.context() as without:
         without.setattr(search, "search_pose", None)
         assert detector.are_colliding(poses[-1:] + 5.0, workers=1)[0]
-    # What is remembered is shared with other clearances, by which it may not count.
+    # The remembered pair is shared with detectors of other clearances, where it may not count.
     others = [detector.with_clearance(other) for other in (0.0, 1e-7, 0.05)]
     verdicts = []
     for other in others:
@@ -170,7 +170,7 @@ def test_progress_rises_to_the_total(
 
 
 class PolledBy(Job):
-    """A job that notes which threads ask it."""
+    """A job that records the threads that poll it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -191,7 +191,7 @@ def test_one_pose_starts_no_thread(crumpled: tuple[CollisionDetector, np.ndarray
 
 
 class CancelledAtPoll(Job):
-    """A job that is cancelled just before it is asked for the n-th time."""
+    """A job that is cancelled just before its n-th poll."""
 
     def __init__(self, n: int) -> None:
         super().__init__()
@@ -226,10 +226,10 @@ def test_cancelling(
             workers=workers,
             job=CancelledAtPoll(5).part(lambda done, _: done_at.append(done)),
         )
-    # Four tasks of a few poses went ahead, and no thread is left.
+    # Four tasks of a few poses ran on, and no thread is left.
     assert done_at[-1] < len(many) // 4
     assert threading.active_count() == n_threads
-    # A job that is never cancelled changes nothing, and the detector is as good as before.
+    # A job that is never cancelled changes nothing, and the detector still works.
     idle = search(poses, job=Job())
     verdict = idle.colliding if mode == "detect_batch" else idle
     assert verdict.tolist() == [detector.detect(pose).colliding for pose in poses]
@@ -297,7 +297,7 @@ def test_a_vertex_that_is_not_finite_is_named(
             detector.are_colliding(broken, workers=workers)
     with pytest.raises(ShapeError, match=r"vertex 41 of the reference"):
         CollisionDetector(detector.topology, broken[13])
-    # Nothing of it is left behind.
+    # It leaves no state behind.
     assert detector.are_colliding(poses[13:14])[0] == detector.detect(poses[13]).colliding
 
 
@@ -347,10 +347,10 @@ assert detector.are_colliding(vertices[None].astype(np.float32)).all()
 print([(f.stats.cache_hits.total(), f.stats.cache_misses.total())
        for f in (search_pose, add_vertex_energy)])
 """
-    # The first may find the code of earlier runs of the tests, or compile it and store it.
+    # The first run may find the code cached by earlier tests, or compile and store it.
     for _ in range(2):
         answer = subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True
         )
-    # One version each, for one mode or the other and any precision of the poses.
+    # One compiled version each, for both modes and any precision of the poses.
     assert answer.stdout.strip() == "[(1, 0), (1, 0)]"

@@ -17,25 +17,25 @@ N = 40
 
 
 def random_pairs(seed: int = 0) -> FloatArray:
-    """(N, 2, 3, 3) triangles about the size of a body."""
+    """(N, 2, 3, 3) pairs of triangles about the size of a body."""
     return np.random.default_rng(seed).uniform(-0.5, 0.5, (N, 2, 3, 3))
 
 
 def flat(pairs: FloatArray) -> FloatArray:
-    """Lay both triangles into one plane that no axis is in."""
+    """Put both triangles into one plane that contains no axis."""
     pairs[..., 2] = 0.0
     return pairs @ random_rotation(np.random.default_rng(5)).T
 
 
 def thin(pairs: FloatArray, height: float, seed: int = 2) -> FloatArray:
-    """Make both triangles slivers that may cross each other in the middle."""
+    """Make both triangles slivers that may cross in the middle."""
     noise = np.random.default_rng(seed).uniform(-height, height, (N, 2, 3))
     pairs[:, :, 2] = 0.3 * pairs[:, :, 1] + 0.7 * pairs[:, :, 0] + noise
     return pairs - pairs.mean(axis=2, keepdims=True)
 
 
 def with_edges_along(pairs: FloatArray, apart: float) -> FloatArray:
-    """Put an edge of one about along an edge of the other."""
+    """Align an edge of one approximately with an edge of the other."""
     noise = np.random.default_rng(3).uniform(-apart, apart, (N, 2, 3))
     edge = pairs[:, 0, 1] - pairs[:, 0, 0]
     pairs[:, 1, 0] = pairs[:, 0, 0] - 0.3 * edge + noise[:, 0]
@@ -49,7 +49,7 @@ def sharing(pairs: FloatArray, n_corners: int) -> FloatArray:
 
 
 def nested(pairs: FloatArray) -> FloatArray:
-    """Put a small triangle into a large one, in its plane."""
+    """Put a small triangle inside a large one, in its plane."""
     weights = np.array([[0.4, 0.3, 0.3], [0.3, 0.4, 0.3], [0.3, 0.3, 0.4]])
     pairs[:, 1] = weights @ pairs[:, 0]
     return pairs
@@ -92,7 +92,7 @@ def test_distance_is_that_of_exact_arithmetic(kind: str) -> None:
     for first, second in ((a, b), (b, a)):
         measured = triangle_distance(first, second)
         np.testing.assert_allclose(measured.distance, expected, rtol=0.0, atol=1e-12)
-        # The two places lie on the triangles, that far apart.
+        # The two nearest points lie on the triangles, at that distance.
         assert measured.weights.min() >= 0.0
         places = np.einsum("pst,pstc->psc", measured.weights, np.stack([first, second], axis=1))
         apart = np.linalg.norm(places[:, 0] - places[:, 1], axis=1)
@@ -125,7 +125,7 @@ def test_distance_is_that_of_coal() -> None:
             result = coal.DistanceResult()
             request = coal.DistanceRequest()
             coal.distance(model(pair[0]), here, model(pair[1]), here, request, result)
-            # Where they cross, theirs says how deep.
+            # If they cross, the other library's distance is minus the depth.
             assert max(result.min_distance, 0.0) == pytest.approx(distance, abs=1e-9)
 
 
@@ -162,7 +162,7 @@ def test_slopes_are_those_of_differences() -> None:
             np.testing.assert_allclose(
                 slopes[apart, corner, axis], measured[apart], rtol=0.0, atol=1e-5
             )
-    # Moving both alike changes nothing; moving one away, all there is.
+    # Moving both equally changes nothing; moving one away changes the distance by as much.
     np.testing.assert_allclose(slopes[apart].sum(axis=1), 0.0, atol=1e-14)
     np.testing.assert_allclose(
         np.linalg.norm(slopes[apart, :3].sum(axis=1), axis=1), 1.0, atol=1e-13

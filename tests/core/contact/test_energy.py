@@ -1,4 +1,4 @@
-"""Algorithm 1 on numbers worked by hand, and the sums of its vector."""
+"""Algorithm 1 on values by hand, and the sums of its vector."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def detector_of(triangles: list, height: float) -> CollisionDetector:
 def test_one_pair_gives_a_sixth_of_its_squared_depth_to_each_vertex() -> None:
     mesh = soup([FLOOR, SHALLOW])
     found = detector_of([FLOOR, SHALLOW], 4.0).detect(mesh.vertices)
-    # 0.25 deep, 4 high: (1/16)^2 / 6 on all six.
+    # 0.25 deep, 4 high: (1/16)^2 / 6 at all six vertices.
     np.testing.assert_allclose(found.penetration_depth, [1 / 16], rtol=1e-14)
     np.testing.assert_allclose(found.vertex_energy, np.full(6, 1 / 1536), rtol=1e-14)
     assert found.energy == pytest.approx(1 / 256, rel=1e-14)

@@ -1,4 +1,4 @@
-"""The check on a GPU, in a process where numba simulates one; and that nothing else needs CUDA."""
+"""The GPU check, with a GPU simulated by Numba; nothing else needs CUDA."""
 
 from __future__ import annotations
 

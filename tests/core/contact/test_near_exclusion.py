@@ -1,4 +1,4 @@
-"""Which pairs count as folds of the skin: distance along the reference mesh, to the last unit."""
+"""Pairs that are folds of the skin: exact distance along the reference mesh."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from tests.core.contact.detector_checks import near_pairs, near_penetration_dept
 from tests.core.shapes import Mesh, grid, join, random_rotation, soup, strip
 
 STRAIGHT = strip([[x, 0.0] for x in range(9)])
-"""The reference: 8 segments of length 1, so 8 high."""
+"""The reference: 8 segments of length 1, so the body size is 8."""
 
 LOOP = strip(
     [[0, 0], [2, 0], [4, 0], [4, 2], [3, 3], [1.5, 1.5], [0, -1], [0, -2], [0, -3]]
 )  # fmt: skip
-"""A pose of it whose segment 5 comes back through segment 0.
+"""A pose of it whose segment 5 returns through segment 0.
 
-It passes at 0.45 of segment 0 and at 0.6 of its own length, so from y = 0 the two lower faces
+It crosses at 0.45 of segment 0 and at 0.6 of its own length. So from y = 0 the two lower faces
 meet up to y = 0.45, then upper 0 meets lower 5 up to 0.6, then the two upper faces meet.
 """
 LOWER_0, UPPER_0, LOWER_5, UPPER_5 = 0, 1, 10, 11
 AT_DISTANCE_4 = [[LOWER_0, LOWER_5], [UPPER_0, UPPER_5]]
-"""Four edges lie between column 1 and column 5, in the row that both faces have a corner in."""
+"""Four edges lie between columns 1 and 5, in a row in which both faces have a corner."""
 AT_DISTANCE_5 = [[UPPER_0, LOWER_5]]
-"""They have no such row in common: one edge more."""
+"""They share no such row: one edge more."""
 
 
 def path_lengths(mesh: Mesh) -> np.ndarray:
@@ -103,7 +103,7 @@ def test_pairs_up_to_the_distance_are_near(near_exclusion: float, near: list[lis
 
 
 def test_lengths_are_those_of_the_reference_not_of_the_pose() -> None:
-    # On the loop itself the way round is longer than all of its height.
+    # On the loop itself, the way around is longer than its height.
     detector = CollisionDetector(LOOP.topology, LOOP.vertices, rules=ContactRules(0.625))
     round_trip = pair_distances(LOOP, np.array(AT_DISTANCE_4 + AT_DISTANCE_5))
     assert round_trip.min() > 0.625 * detector.body_size
@@ -111,7 +111,7 @@ def test_lengths_are_those_of_the_reference_not_of_the_pose() -> None:
 
 
 def test_the_path_is_along_the_mesh_not_through_the_air() -> None:
-    # Faces that pass through each other are at distance 0 through the air.
+    # The Euclidean distance of faces that pass through each other is 0.
     detector = CollisionDetector(LOOP.topology, LOOP.vertices, rules=ContactRules(1e-3))
     found = detector.detect(LOOP.vertices)
     assert (len(found.pairs), len(near_pairs(found))) == (3, 0)
@@ -126,7 +126,7 @@ def test_another_component_is_never_near() -> None:
 
 
 def test_duplicate_vertices_are_at_distance_zero_and_linked() -> None:
-    # One more column in the same place: the path is no longer, and not broken either.
+    # A duplicate column: the path is neither longer nor interrupted.
     columns = [[x, 0.0] for x in (0, 1, 2, 2, 3, 4, 5, 6, 7, 8)]
     reference = strip(columns)
     pose = strip(np.insert(LOOP.vertices[::2][:, [0, 2]], 3, [4, 1], axis=0))
@@ -141,7 +141,7 @@ def test_duplicate_vertices_are_at_distance_zero_and_linked() -> None:
 
 
 def test_the_first_hit_is_sought_past_near_pairs_in_whatever_order() -> None:
-    """A crumpled sheet, all of whose pairs are near, and one blade somewhere in the mesh."""
+    """A crumpled sheet with only near pairs, and one blade somewhere in the mesh."""
     rng = np.random.default_rng(4)
     sheet = grid(12)
     crumpled = Mesh(sheet.vertices + rng.normal(scale=0.2, size=sheet.vertices.shape), sheet.faces)
@@ -158,7 +158,7 @@ def test_the_first_hit_is_sought_past_near_pairs_in_whatever_order() -> None:
         )
         poses = np.stack([join(crumpled, blade).vertices for blade in (through, apart)])
         batch = detector.detect_batch(poses)
-        # More than the room that a search starts with.
+        # More than the initial buffer of a search.
         assert batch.n_near_pairs.min() > 600
         assert batch.n_pairs[0] > 0
         assert batch.n_pairs[1] == 0
@@ -169,7 +169,7 @@ def test_the_first_hit_is_sought_past_near_pairs_in_whatever_order() -> None:
 def test_near_pairs_of_a_crumpled_sheet_against_brute_force(near_exclusion: float) -> None:
     rng = np.random.default_rng(9)
     sheet = grid(10)
-    # An uneven reference, so that no path happens to be as long as the limit.
+    # An uneven reference, so that no path happens to equal the limit.
     uneven = Mesh(sheet.vertices + rng.normal(scale=0.02, size=sheet.vertices.shape), sheet.faces)
     pose = uneven.vertices + rng.normal(scale=0.3, size=sheet.vertices.shape)
     detector = CollisionDetector(

@@ -1,4 +1,4 @@
-"""Proposals of groups to ignore: those in contact in nearly every pose, with their share."""
+"""Proposed ignored groups: those in contact in nearly every pose, with their share."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FLOOR = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
 BLADE = [[1, 1, -1], [1, 1, 1], [2, 1, 1]]
 POST = [[0.5, 0.5, -1], [0.5, 0.5, 1], [0.6, 0.5, 1]]
 MESH = soup([FLOOR, BLADE, POST])
-"""The blade and the post stand in the floor, and not in each other."""
+"""The blade and the post penetrate the floor, but not each other."""
 FLOOR_GROUP, BLADE_GROUP, POST_GROUP = (
     FaceGroup(name, np.array([n])) for n, name in enumerate(("floor", "blade", "post"))
 )
@@ -37,7 +37,7 @@ GROUPS = (FLOOR_GROUP, BLADE_GROUP, POST_GROUP)
 
 
 def poses() -> np.ndarray:
-    """Return 10 poses; the blade is out of the floor in two of them."""
+    """Return 10 poses; in two of them the blade is out of the floor."""
     moved = np.stack([MESH.vertices] * 10)
     moved[:2, 3:6] += [0.0, 0.0, 5.0]
     return moved
@@ -50,7 +50,7 @@ def detector(rules: ContactRules | None = None) -> CollisionDetector:
 def proposed(
     detector: CollisionDetector, poses: np.ndarray, groups: tuple[FaceGroup, ...], *share: float
 ) -> tuple[ProposedPair, ...]:
-    """Return what is proposed among groups of one kind."""
+    """Return the proposals among groups of one kind."""
     return propose_by_kind(detector, poses, {"all": groups}, *share)["all"]
 
 
@@ -113,7 +113,7 @@ def test_bad_groups_are_refused_and_cancelling_is_heard() -> None:
 def test_groups_are_told_apart_by_kind_also_where_the_mesh_lists_them() -> None:
     labels = np.array(["left"] * 3 + ["right"] * 6)
     parts, components = part_groups(MESH.topology, labels), component_groups(MESH.topology)
-    # A mesh of the name of a part stands for itself.
+    # A mesh with the name of a body part denotes itself.
     mesh = FaceGroup("left", np.array([2]))
     kinds = groups_by_kind((mesh, parts[1], components[0]), MESH.topology, labels)
     names = {kind: [group.name for group in groups] for kind, groups in kinds.items()}
@@ -142,7 +142,7 @@ def test_of_very_many_groups_the_first_are_looked_at() -> None:
 
 
 def sliding(n_poses: int, n_touching: int) -> tuple[Mesh, np.ndarray]:
-    """Return a band over a plate, and poses in some of which its middle dips into the plate."""
+    """Return a band over a plate, and poses; in some, the band's middle dips into the plate."""
     plate, band = strip([[x, 0.0] for x in range(21)]), strip([[x + 0.1, 0.3] for x in range(21)])
     mesh = join(plate, band)
     poses = np.stack([mesh.vertices] * n_poses)
@@ -155,7 +155,7 @@ def sliding(n_poses: int, n_touching: int) -> tuple[Mesh, np.ndarray]:
 def test_patches_that_touch_in_nearly_every_pose_are_found_and_nothing_else() -> None:
     mesh, poses = sliding(20, 19)
     detector = CollisionDetector(mesh.topology, mesh.vertices)
-    # Once, far from there, the band dips elsewhere.
+    # In one pose, the band also dips far from there.
     poses[3, 42 + 2 * 3 : 42 + 2 * 5, 2] -= 0.6
     pairs = touching_patches(detector, poses, 0.1)
     assert 0 < len(pairs) < 6
@@ -164,7 +164,7 @@ def test_patches_that_touch_in_nearly_every_pose_are_found_and_nothing_else() ->
     rules = ContactRules(touching=pairs, touching_radius=0.1)
     ruled = detector.with_rules(rules)
     assert ruled.are_colliding(poses).tolist() == [pose == 3 for pose in range(20)]
-    # Each patch is in contact in 19 poses of 20, by an independent reading of what lies in it.
+    # By independent code, each patch is in contact in 19 of 20 poses.
     applied = IndependentRules(
         mesh.vertices, mesh.faces, [], rules.to_json() | {"touching_radius": 0.1}, {}
     )
@@ -175,7 +175,7 @@ def test_patches_that_touch_in_nearly_every_pose_are_found_and_nothing_else() ->
             for found in map(detector.detect, poses)
         ]
         assert sum(in_contact) == 19
-    # Less often is not nearly always; what a rule excludes already is not found again.
+    # Rarer contacts are not proposed, nor those that a rule already excludes.
     assert touching_patches(detector, sliding(20, 18)[1], 0.1) == ()
     assert touching_patches(ruled, np.delete(poses, 3, axis=0), 0.1) == ()
     with pytest.raises(ShapeError, match="must be of faces of this mesh, got 500"):
@@ -183,10 +183,10 @@ def test_patches_that_touch_in_nearly_every_pose_are_found_and_nothing_else() ->
 
 
 def test_places_of_pieces_that_touch_in_nearly_every_pose_are_found_where_asked() -> None:
-    """The band touches the plate in every pose, at places by turns: a shield held by a hand."""
+    """The band touches the plate in every pose, at changing places, like a shield in a hand."""
     mesh, poses = sliding(20, 20)
     detector = CollisionDetector(mesh.topology, mesh.vertices)
-    # In 8 of the poses it dips in elsewhere, at each place in too few of them.
+    # In 8 poses it dips in elsewhere, but at each place in too few of them.
     straight = mesh.vertices[42:]
     for pose in range(8):
         poses[pose, 42:] = straight
@@ -197,12 +197,12 @@ def test_places_of_pieces_that_touch_in_nearly_every_pose_are_found_where_asked(
     middle = mesh.vertices[mesh.faces][:, :, 0].mean(axis=1)
     assert len(pairs) > 0
     assert (np.abs(middle[np.array(pairs)] - 10.0) < 5.0).all()
-    # On the reference the band stands off there: it is by the pose that it touches.
+    # On the reference, the band is away from the plate: it touches only in poses.
     raised = mesh.vertices.copy()
     raised[42 + 2 * 8 : 42 + 2 * 14, 2] += 7.0
     apart = CollisionDetector(mesh.topology, raised)
     assert touching_patches(apart, poses, 0.1, of_pieces=True) == ()
-    # Nor are those of pieces that are free of each other in a fifth of the poses.
+    # Nor are places of pieces that are apart in a fifth of the poses.
     poses[:4] = mesh.vertices
     assert touching_patches(detector, poses, 0.1, of_pieces=True) == ()
 

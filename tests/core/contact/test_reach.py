@@ -1,4 +1,4 @@
-"""Lists of near faces against SciPy's shortest paths."""
+"""Lists of near faces, compared with SciPy's shortest paths."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.core.shapes import Mesh, grid, join, soup
 
 
 def sheet() -> Mesh:
-    """Return a crumpled sheet and a loose face, with an edge of no length."""
+    """Return a crumpled sheet and a loose face, with a zero-length edge."""
     mesh = join(grid(9), soup([[[0, 0, 2], [1, 0, 2], [0, 1, 2]]]))
     vertices = mesh.vertices + np.random.default_rng(5).normal(
         scale=0.04, size=(len(mesh.vertices), 3)

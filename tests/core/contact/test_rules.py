@@ -1,4 +1,4 @@
-"""Contact rules against an independent reading of them, pair by pair."""
+"""Contact rules, compared pair by pair with an independent implementation."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ RULES = ("near", "rest", "ignored", "tolerated", "joint", "touching")
 FLOOR = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
 BLADE = [[1, 1, -1], [1, 1, 1], [2, 1, 1]]
 CROSSING = soup([FLOOR, BLADE])
-"""Face 0 and face 1 collide, by 1 of the body size 4."""
+"""Faces 0 and 1 collide with depth 1; the body size is 4."""
 
 
 def check_by_the_text(
     rest: Mesh, pose: np.ndarray, rules: ContactRules, groups: tuple[FaceGroup, ...] = ()
 ) -> SelfCollisions:
-    """Compare every mode of a detector with the rules applied pair by pair."""
+    """Compare every mode of a detector with rules applied pair by pair."""
     detector = CollisionDetector(rest.topology, rest.vertices, rules, groups)
     size = detector.body_size
     colliding = all_pairs(pose, rest.faces, DEPTH_TOLERANCE * size)
@@ -104,7 +104,7 @@ def test_random_meshes_and_rules_agree_with_the_text(
 
 
 def test_each_rule_is_the_first_for_some_pair() -> None:
-    """So that the random comparison does not pass on meshes that no rule applies to."""
+    """Otherwise the random comparison could pass on meshes to which no rule applies."""
     rng = np.random.default_rng(3)
     mesh = join(grid(6), soup(rng.uniform(size=(20, 3, 3))))
     rest = Mesh(mesh.vertices + rng.normal(scale=0.05, size=mesh.vertices.shape), mesh.faces)
@@ -155,7 +155,7 @@ def test_a_pose_whose_rest_is_apart_is_not_excluded() -> None:
 
 
 def test_faces_that_lie_on_each_other_at_rest_touch() -> None:
-    """Cloth on skin: depth 0 at rest, and through it after the least movement."""
+    """Cloth on skin has depth 0 at rest, and penetrates after the slightest movement."""
     rest = soup([FLOOR, [[0.5, 0.5, 0], [1.5, 0.5, 0], [0.5, 1.5, 0]]])
     through = rest.vertices + np.array([[0.0] * 3] * 3 + [[0, 0, -0.1], [0, 0, 0.1], [0, 0, 0.1]])
     strict = CollisionDetector(rest.topology, rest.vertices)
@@ -195,7 +195,7 @@ def test_the_tolerated_depth_is_a_limit_that_does_not_count() -> None:
 
 
 def test_a_pair_of_groups_has_a_tolerated_depth_of_its_own() -> None:
-    """A belly may give and a hand may not: what counts is compared with all pairs."""
+    """A belly may yield and a hand may not; compared with all pairs."""
     rng = np.random.default_rng(8)
     parts = [soup(rng.uniform(size=(30, 3, 3))) for _ in range(3)]
     mesh = join(*parts)
@@ -218,7 +218,7 @@ def test_a_pair_of_groups_has_a_tolerated_depth_of_its_own() -> None:
     detector = CollisionDetector(mesh.topology, mesh.vertices, rules, groups)
     asked = np.array([[0, 31], [31, 0], [65, 3], [60, 70], [0, 1]])
     np.testing.assert_allclose(detector.tolerated_depths(asked), [0.1, 0.1, 0.0, 0.2, 0.03])
-    # Of several, the least holds.
+    # If several apply, the smallest counts.
     both = ContactRules(tolerated_pairs=(*own, ("belly", "thigh", 0.02), ("thigh", "belly", 0.3)))
     least = CollisionDetector(mesh.topology, mesh.vertices, both, groups)
     np.testing.assert_allclose(least.tolerated_depths(asked[:1]), 0.02)

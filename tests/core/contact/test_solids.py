@@ -1,4 +1,4 @@
-"""One solid of a mesh of many layers."""
+"""One solid from a mesh of many layers."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_a_layer_that_crosses_itself_becomes_what_is_seen_from_outside() -> None
     assert kinds == ["closed"]
     parts = [(tube.vertices, tube.faces)]
     assert solid.volume() == pytest.approx(column_volume(parts), rel=2e-3)
-    # What lies in both loops counts once.
+    # The intersection of both loops counts once.
     assert solid.volume() < 0.998 * trimesh.Trimesh(*tube).volume
     require_printable(solid)
 

@@ -1,4 +1,4 @@
-"""The tree holds every face once, its leaves are full, and it loses no pair."""
+"""The tree contains every face once, its leaves are full, and it misses no pair."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.core.shapes import Mesh, box, interlocked_tori, join, soup
     [
         interlocked_tori(0.6),
         soup(np.random.default_rng(8).random((333, 3, 3))),
-        # All centroids alike along two axes, and in sorted order along the third.
+        # All centroids are equal along two axes, and sorted along the third.
         join(*(box([0, 0, z], [1, 1, z + 1.5]) for z in range(40))),
         soup(np.tile(np.random.default_rng(8).random((1, 3, 3)), (100, 1, 1))),
     ],

@@ -1,4 +1,4 @@
-"""What a search skips never counts, and all that is known to never count is skipped."""
+"""A search skips exactly the pairs that are known never to count."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ RULES = {
 
 
 def _bodies(rules: ContactRules) -> tuple[CollisionDetector, np.ndarray]:
-    """Return a sheet, a ball in it and loose faces, and poses of them."""
+    """Return the detector of a sheet, a ball in it and loose faces, and poses of them."""
     rng = np.random.default_rng(5)
     ball = sphere(0.3, 8).moved([0.5, 0.5, 0.1])
     mesh = join(grid(11), ball, soup(0.2 * rng.uniform(size=(20, 3, 3))))
@@ -65,7 +65,7 @@ def test_a_search_that_skips_finds_the_same_pairs(rules: ContactRules) -> None:
     assert np.array_equal(counted.n_pairs, batch.n_pairs)
     assert np.array_equal(counted.vertex_energy, batch.vertex_energy)
     assert counted.n_excluded.sum() == 0 < batch.n_excluded.sum()
-    # In one plane nothing is deep in anything.
+    # In one plane, nothing penetrates.
     asked = np.concatenate([poses[:2], poses[:1] * [1.0, 1.0, 0.0]])
     verdicts = [len(detector.detect(pose).pairs) > 0 for pose in asked]
     assert any(verdicts)

@@ -1,4 +1,4 @@
-"""What joins the components of a body is kept with its latent space."""
+"""The edges that join a body's components are stored with its latent space."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_a_stored_latent_space_decodes_by_the_bridges_that_it_was_trained_with(
     assert arrays["bridges"].shape[1] == 2
     again, latent = Embedding.from_arrays(arrays, metadata), trained.training_latent[:3]
     np.testing.assert_array_equal(again.decode(latent), trained.decode(latent))
-    # Older models have none, and decode as they did.
+    # Older models have none, and decode as before.
     older = {name: values for name, values in arrays.items() if name != "bridges"}
     before = Embedding.from_arrays(older, metadata)
     assert before.to_arrays()[0].keys() == older.keys()

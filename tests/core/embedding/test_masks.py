@@ -1,4 +1,4 @@
-"""Attention masks, and what is measured of them."""
+"""Attention masks and their statistics."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_islands_go_to_the_next_strongest_component() -> None:
     components[1, 4:6, 1] = 3.0
     components[2, 10:12, 2] = 1.0
     components[2, 20:22, 2] = 4.0
-    # The norms do not count, so that the last is no stronger for being longer.
+    # Norms do not count: a larger norm does not make the last component stronger.
     components[2] *= 0.1
     before = components.copy()
     kept = keep_one_patch(components, mesh.topology, mesh.vertices)

@@ -1,4 +1,4 @@
-"""The networks of both levels, and the tables made of them."""
+"""The networks of both levels, and the decoding tables made from them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.core.shapes import Mesh, sphere
 
 
 def small_network(n_codes: int, seed: int, mesh: Mesh) -> TiedAutoencoder:
-    """Make an autoencoder in float64 with nothing left at its start values."""
+    """Make an autoencoder in float64 without initial values left."""
     rng = np.random.default_rng(seed)
     torch.set_default_dtype(torch.float64)
     try:
@@ -117,7 +117,7 @@ def test_ring_mean_is_the_mean_over_neighbours() -> None:
 def bilevel_weights(
     mesh: Mesh,
 ) -> tuple[AutoencoderWeights, tuple[AutoencoderWeights, ...], npt.NDArray[np.float32]]:
-    """Random weights of both levels; the two masks overlap in part."""
+    """Random weights of both levels; the two masks overlap partly."""
     rng = np.random.default_rng(4)
     n_vertices = mesh.topology.n_vertices
     mask = np.zeros((2, n_vertices), dtype=np.float32)
@@ -210,7 +210,7 @@ def test_tangents_of_the_decoder_match_finite_differences() -> None:
     latent = np.random.default_rng(5).standard_normal(8).astype(np.float32)
     tangents = decoder.tangents(latent)
     for code in range(8):
-        # Codes are single precision when they are decoded.
+        # Decoding uses codes in single precision.
         step = np.float32(2**-8) * np.eye(8, dtype=np.float32)[code]
         ahead, behind = (decoder.features((latent + sign * step)[None])[0] for sign in (1, -1))
         slope = (ahead - behind) / 2**-7

@@ -15,7 +15,7 @@ from lcollision_core.files import PoseSet
 
 @pytest.fixture(scope="module")
 def scape_embedding(scape: PoseSet) -> Iterator[Embedding]:
-    # Every other pose, and level 2 trained a tenth as long as by default: the bounds have room.
+    # Every second pose, and level 2 trained a tenth as long as by default: the bounds allow it.
     config = replace(EmbeddingConfig(), level2_epochs=6, held_out_stride=0)
     n_threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -44,7 +44,7 @@ def test_masks_are_patches_of_the_body(scape_embedding: Embedding) -> None:
 def test_left_and_right_limbs_are_separate(scape_embedding: Embedding) -> None:
     rest = scape_embedding.rest_vertices
     owner = scape_embedding.attention_mask.argmax(axis=0)
-    # SCAPE stands along x, its arms spread along z.
+    # SCAPE stands along x, with arms spread along z.
     up, across = rest[:, 0], rest[:, 2]
     middle = 0.5 * (across.min() + across.max())
     left, right = np.flatnonzero(across > middle), np.flatnonzero(across < middle)

@@ -1,4 +1,4 @@
-"""Domains that move as one, and the windows and components that start from them."""
+"""Domains that move rigidly, and the windows and components that start from them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def turning_in_blocks(blocks: list[int], n_poses: int = 6) -> FloatArray:
-    """Features of a strip whose blocks of columns turn each by its own angles."""
+    """Features of a strip whose blocks of columns each turn by their own angles."""
     rng = np.random.default_rng(0)
     features = np.zeros((n_poses, 2 * sum(blocks), 9))
     features[..., [3, 6, 8]] = 1.0
@@ -85,7 +85,7 @@ def test_distances_run_along_the_edges_from_each_domain() -> None:
     domain_of[:2] = 1
     distances = domain_distances(domain_of, mesh.topology, mesh.vertices)
     assert (distances[0, 2:] == 0.0).all()
-    # Along edges the farthest vertices are 11 apart: 10 columns and once across.
+    # Along edges, the farthest vertices are 11 apart: 10 columns and once across.
     assert distances[1, ::2] == pytest.approx(np.arange(11) / 11)
     assert distances[1, 1::2] == pytest.approx(np.arange(11) / 11)
 

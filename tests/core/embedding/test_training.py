@@ -39,7 +39,7 @@ SMALL = EmbeddingConfig(
 
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
-    """Keep torch from spreading arrays of a few kilobytes over all cores."""
+    """Keep torch from distributing arrays of a few kilobytes over all cores."""
     n_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -47,7 +47,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def bent_tube(first: float, second: float) -> npt.NDArray[np.float64]:
-    """Vertices of a tube along y, length 1, bent by two angles at a third and two thirds."""
+    """Return a tube along y, length 1, bent by two angles at a third and two thirds."""
     along = np.linspace(0.0, 1.0, 401)
 
     def bent_by(angle: float, place: float) -> npt.NDArray[np.float64]:
@@ -113,7 +113,7 @@ def test_tube_is_rebuilt_and_split_where_it_bends() -> None:
     quality = judge_masks(embedding.attention_mask, embedding.topology, embedding.rest_vertices)
     assert quality.connected_share.tolist() == [1.0, 1.0, 1.0]
     assert quality.domains_per_vertex < 2.0
-    # Numbered from the upper end down; each straight piece belongs to one domain.
+    # Numbered from the upper end; each straight piece belongs to one domain.
     owner = embedding.attention_mask.argmax(axis=0).reshape(N_RINGS, N_SIDES)
     assert (owner[22:] == 0).all()
     assert (owner[11:14] == 1).all()
@@ -196,7 +196,7 @@ class CancelAt:
 
 @pytest.mark.parametrize(
     "report",
-    # In level 2 of the model of all poses, and among the codes of the one with poses held out.
+    # In level 2 of the model of all poses, and in the codes of the one with held-out poses.
     [8, 45, *(pytest.param(report, marks=pytest.mark.slow) for report in (6, 20, 42))],
 )
 def test_resumed_training_equals_uninterrupted(tmp_path: Path, report: int) -> None:
@@ -283,7 +283,7 @@ def test_encode_gives_the_code_of_a_moved_mesh_back() -> None:
         back = moved @ fit.rotation.T + fit.translation
         assert np.abs(again - back).max() < 1e-3
         still = embedding.encode(decoded)
-        # Float32 codes and a fit that stops at 2 % gain leave this much between the two.
+        # Float32 codes and a fit that stops at 2 % gain explain this difference.
         assert np.abs(fit.latent - still.latent).max() < 1e-3 * np.abs(still.latent).max()
 
 

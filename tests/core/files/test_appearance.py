@@ -1,4 +1,4 @@
-"""How glTF files look: read where it is asked for, whatever they say of it."""
+"""The appearance of glTF files, read on request, however it is given."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_materials_are_those_that_trimesh_reads(tmp_path: Path) -> None:
     )
     # trimesh counts v from below.
     np.testing.assert_allclose(look.uv * [1, -1] + [0, 1], other.visual.uv, atol=1e-6)
-    # What half of the light is on a screen, by the standard of sRGB.
+    # Half the light in sRGB.
     np.testing.assert_array_equal(look.colours[0], [188, 137, 255, 191])
 
 
@@ -123,7 +123,7 @@ def test_coordinates_are_those_of_the_set_moved_by_the_material(tmp_path: Path) 
     laid = {"index": texture, "texCoord": 0, "extensions": {"KHR_texture_transform": moved}}
     material = coloured(baseColorTexture=laid)
     look = look_of(textured_cube(material, builder, TEXCOORD_1=second), tmp_path)
-    # As three.js has it: scaled, turned counter-clockwise where v goes down, moved.
+    # As in three.js: scaled, rotated counter-clockwise with v down, translated.
     u, v = 2.0 * own[:, 0], 0.5 * own[:, 1]
     cosine, sine = np.cos(0.3), np.sin(0.3)
     expected = np.stack([cosine * u + sine * v + 0.1, cosine * v - sine * u + 0.2], axis=1)
@@ -244,7 +244,7 @@ def test_a_damaged_image_leaves_the_colour_and_a_note(
 ) -> None:
     builder = textured({"baseColorFactor": [1.0, 0.0, 0.0, 1.0]}, image)
     file = builder.write(tmp_path / "cube.glb")
-    # What does not look at it does not read it.
+    # Code that does not need the appearance does not read it.
     assert read_character(file).notes == ("16 vertices were joined with others at seams",)
     look = look_of(builder, tmp_path)
     assert look.materials[0].texture is None
@@ -343,7 +343,7 @@ def test_each_copy_of_an_instanced_mesh_has_its_look(tmp_path: Path) -> None:
 
 
 def painted_fbx(folder: Path, texture: str | None = None) -> Path:
-    """Write a tube of a red material, with texture coordinates of its own at each corner."""
+    """Write a tube with a red material, and separate texture coordinates at each corner."""
     file = arm_fbx(folder / "arm.fbx")
     text = file.read_text()
     _, faces = tube()

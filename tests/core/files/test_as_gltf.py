@@ -1,4 +1,4 @@
-"""A character of FBX as the rigged GLB that gives it back."""
+"""An FBX character as an equivalent rigged GLB."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytest.importorskip("ufbx")
 
 
 def _written(made: GltfCharacter, path: Path) -> Character:
-    """Write a character with all its clips as they are, and read it again."""
+    """Write a character with all its clips unchanged, and read it again."""
     path.write_bytes(changed_gltf(made.character, []))
     return read_character(path)
 
@@ -95,11 +95,11 @@ def test_its_colours_texture_coordinates_and_normals_come_along(tmp_path: Path) 
     before, after = character.look(), again.look()
     assert before is not None
     assert after is not None
-    # Without a texture, coordinates say nothing.
+    # Without a texture, coordinates do not matter.
     in_file, read = (look.uv[look.faces][half:] for look in (after, before))
     np.testing.assert_array_equal(in_file, read)
     np.testing.assert_array_equal(after.colours[after.faces], before.colours[before.faces])
-    # Each face has its own normal, turned upright with it.
+    # Each face has its own normal, rotated upright with it.
     attributes = mesh["primitives"][0]["attributes"]
     normals = document.array(attributes["NORMAL"], "normals", ("VEC3",))
     faces = document.array(mesh["primitives"][0]["indices"], "indices", ("SCALAR",)).reshape(-1, 3)
@@ -164,7 +164,7 @@ def test_vertices_of_many_joints_keep_all_their_weights(tmp_path: Path) -> None:
     assert again.rig is not None
     held = np.sort(again.rig.weights)[:, -n_joints:]
     np.testing.assert_allclose(held, np.sort(weights), atol=1e-6)
-    # Programs that read four take the strongest.
+    # Programs that read only four influences get the strongest.
     first = mesh["primitives"][0]["attributes"]["WEIGHTS_0"]
     stored = _document(again).array(first, "weights", ("VEC4",))
     assert stored.sum(axis=1).min() >= np.sort(weights)[:, -4:].sum(axis=1).min() - 1e-6

@@ -1,4 +1,4 @@
-"""Mesh files appear whole or not at all."""
+"""Mesh files are written atomically."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several pose sets as one, and near-duplicates left out."""
+"""Several pose sets combined, without near-duplicates."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_the_distance_is_the_root_mean_square_after_the_best_motion(tolerance: f
     poses = bending_tube()
     rest = poses.vertices[0].astype(np.float64)
     size = float(np.ptp(rest, axis=0).max())
-    # Every second vertex out and every other in, along an axis: no motion makes up for that.
+    # Alternate vertices move out and in along an axis, which no rigid motion compensates.
     ways = np.where(np.arange(len(rest)) % 2, 1.0, -1.0)[:, None] * [0.0, 0.0, 1.0]
     ways -= ways.mean(axis=0)
     moved = rest + 0.0045 * size * ways
@@ -65,7 +65,7 @@ def test_each_pose_is_compared_with_all_that_are_kept() -> None:
     size = float(np.ptp(tube.vertices[0], axis=0).max())
     noise = random.normal(size=(60, *tube.vertices.shape[1:])) * size
     vertices = tube.vertices[chosen] + random.uniform(0.0, 0.004, (60, 1, 1)) * noise
-    # A mirror image is another pose.
+    # A mirror image is a different pose.
     vertices = np.concatenate([vertices, vertices[:5] * [1.0, 1.0, -1.0]])
     kept: list[int] = []
     for pose, mesh in enumerate(vertices):

@@ -67,9 +67,9 @@ def test_clips_of_ntsc_rates_keep_their_last_frame(tmp_path: Path, mode: int, ra
     text = path.read_text().replace(
         '"TimeMode", "enum", "", "",6', f'"TimeMode", "enum", "", "",{mode}'
     )
-    # A tick short of 1.001 s, as rounding leaves it.
+    # A tick less than 1.001 s, as after rounding.
     path.write_text(text.replace(str(TICKS), str(TICKS * 1001 // 1000 - 1)))
-    # Of more than 30 frames a second every second one is sampled.
+    # Above 30 frames per second, every second frame is sampled.
     times = read_character(path).sample("wave", None).times
     assert len(times) == rate + 1
     assert times[-1] == pytest.approx(1.001, abs=1e-9)
@@ -91,7 +91,7 @@ def test_frames_are_those_of_the_clip_where_a_rate_is_rounded(tmp_path: Path, ra
 def test_a_blend_shape_is_masked_by_its_weights(tmp_path: Path) -> None:
     path = arm_fbx(tmp_path / "arm.fbx")
     text, full = path.read_text(), "FullWeights: *1 { a: 100 }"
-    # Elsewhere several weights are those of shapes between.
+    # In files from other programs, several weights denote in-between shapes.
     text = text.replace("7400\n}", '7400\n    Creator: "Blender (stable FBX IO) - 5.0.1"\n}', 1)
     vertices, _ = tube()
     changed = np.flatnonzero(vertices[:, 1] > 1.2)
@@ -141,7 +141,7 @@ def test_reading_stops_when_it_is_cancelled(
 
 def test_an_animation_without_a_mesh_is_said(tmp_path: Path) -> None:
     path = arm_fbx(tmp_path / "arm.fbx")
-    # Its geometry hangs on nothing.
+    # Its geometry is not connected to anything.
     path.write_text(path.read_text().replace('C: "OO",100,200', 'C: "OO",100,300'))
     with pytest.raises(MeshFileError, match="an animation, but no mesh; name or open the char"):
         read_character(path)
@@ -170,7 +170,7 @@ def test_a_character_of_fbx_has_its_rig_parts_and_clips(tmp_path: Path) -> None:
     assert rig.joint_names == ("Body", "Lower", "Upper")
     assert rig.parents.tolist() == [-1, -1, 1]
     assert set(joint_parts(character)) == {"Body", "Lower", "Upper"}
-    # The clip's own frames are at the rate of the file, 30 a second.
+    # The clip's own frames are at the file's rate, 30 per second.
     frames = character.sample("wave", None)
     assert frames.transforms is not None
     assert np.allclose(frames.times, np.arange(31) / 30.0)

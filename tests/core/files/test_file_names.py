@@ -1,4 +1,4 @@
-"""What file systems allow: names of poses as names of files, and what an extension says."""
+"""File system limits: pose names as file names, and extensions."""
 
 from __future__ import annotations
 

@@ -22,13 +22,13 @@ from lcollision_core.files.table import WRITABLE_SUFFIXES
 from lcollision_core.meshes import Topology
 from tests.core.background import peak_memory
 
-# One file a test function: hypothesis overwrites it with every example.
+# One file per test function: Hypothesis overwrites it with every example.
 SHARED_FOLDER = settings(
     suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=60
 )
 
-# Vertices out of the order of their first use, two at the same place and one in no face: what a
-# careless reader merges, drops or renumbers.
+# Vertices not in order of first use, two at the same position and one in no face: cases that a
+# careless reader would merge, drop or renumber.
 VERTICES = np.array(
     [[0.1, 0.2, 0.3], [1, 0, 0], [-1.5, 2e-7, 1e5], [0, 1, 0], [0, 1, 0], [1 / 3, 2 / 3, -0.7]]
 )
@@ -52,7 +52,7 @@ def test_round_trip_keeps_every_vertex_and_face(
 ) -> None:
     vertices = VERTICES.astype(dtype)
     faces = FACES
-    if suffix == ".stl":  # it has no place for a vertex in no face
+    if suffix == ".stl":  # it cannot store a vertex without faces
         vertices, faces = np.delete(vertices, 2, axis=0), np.where(FACES > 2, FACES - 1, FACES)
     path = tmp_path / f"mesh{suffix.upper()}"
     write_mesh(path, vertices, faces)
@@ -86,9 +86,9 @@ finite_floats = st.builds(
 def test_any_float64_survives_text_formats_bit_for_bit(
     tmp_path: Path, numbers: list[tuple[float]]
 ) -> None:
-    # Of nothing but subnormal numbers a mesh is coarser than its edges, and refused.
+    # A mesh of only subnormal numbers, coarser than its edges, would be refused: add 1.0.
     vertices = np.resize(np.array([(1.0,), *numbers]), (len(numbers), 3))
-    # So is one that is as far away as its edges have digits.
+    # So would a mesh too far away for the precision of its edges.
     topology = Topology(np.array([[0, 1, 2]]), len(vertices))
     assume(can_hold(vertices, topology, np.float64))
     for suffix in (".obj", ".off", ".ply"):
@@ -121,7 +121,7 @@ def test_obj_counts_vertices_from_one(tmp_path: Path) -> None:
 
 @st.composite
 def obj_texts(draw: st.DrawFn) -> tuple[str, np.ndarray, list[list[int]]]:
-    """Draw an OBJ file in one of its many dialects, and what it means."""
+    """Draw an OBJ file in one of its many dialects, and its expected content."""
     n = draw(st.integers(3, 12))
     coordinate = st.floats(-1e6, 1e6, allow_subnormal=False)
     vertices = np.array(
@@ -224,7 +224,7 @@ def test_polygons_become_fans_and_the_notes_say_so(tmp_path: Path, suffix: str, 
 
 
 def _binary_ply(order: str, rows: list[list[int]], vertices: np.ndarray = VERTICES) -> bytes:
-    """Write a PLY with an element before, a property between and an element after."""
+    """Write a PLY with a further element before, a property between and an element after."""
     name = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
     header = (
         f"ply\nformat {name} 1.0\nelement camera 2\nproperty short id\n"
@@ -319,7 +319,7 @@ def test_glb_whose_vertices_were_split_gets_the_order_of_its_topology(tmp_path: 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_glb_is_written_upright(tmp_path: Path, axis: int, sign: float) -> None:
-    """Turned by right angles only, to the bit; other formats do not say which way is up."""
+    """Rotated by exact right angles; other formats do not define the up axis."""
     up = sign * np.eye(3)[axis] + [0.1, 0.2, -0.3]
     for suffix in (".glb", ".obj"):
         write_mesh(tmp_path / f"m{suffix}", VERTICES, FACES, up=up)
@@ -530,7 +530,7 @@ def test_fifty_million_faces_are_refused_without_taking_memory(tmp_path: Path, s
 
 
 def test_triangles_follow_each_other_in_any_unit(tmp_path: Path) -> None:
-    # STL keeps float32, so an exact triangle at a size where float32 is coarse shows a mix-up.
+    # STL stores float32, so at a scale where float32 is coarse, equality shows a mix-up.
     vertices = VERTICES[[0, 1, 3, 5]] * 1e-30
     write_mesh(tmp_path / "m.stl", vertices, np.array([[0, 1, 2], [3, 2, 1]]))
     corners = read_mesh(tmp_path / "m.stl")
@@ -568,7 +568,7 @@ def test_lines_of_numbers_are_read_alike_at_once_and_word_by_word(
     rows: list[list[float]], is_odd: bool
 ) -> None:
     text = "".join(" ".join(map(repr, row)) + "\n" for row in rows)
-    odd = "1_0\n" if is_odd else "10\n"  # which only the careful way reads
+    odd = "1_0\n" if is_odd else "10\n"  # which only the slow path reads
     values, sizes = number_rows((text + odd).encode(), "row")
     assert values.tolist() == [float(value) for row in rows for value in row] + [10.0]
     assert sizes.tolist() == [len(row) for row in rows] + [1]

@@ -1,4 +1,4 @@
-"""Extensions of glTF: which of them are read, refused, or said to be left out."""
+"""glTF extensions that are read, refused, or reported as ignored."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HIDDEN = {"KHR_node_visibility": {"visible": False}}
 
 
 def _tubes(**node: Any) -> GltfBuilder:
-    """Build a tube that a node shows, of the given fields, and mesh 1, a copy of its mesh."""
+    """Build a tube shown by a node with the given fields, and mesh 1, a copy of its mesh."""
     builder = GltfBuilder()
     vertices, faces = tube()
     attributes = {"POSITION": builder.array(vertices)}
@@ -49,7 +49,7 @@ def test_instances_are_as_many_shapes_and_follow_their_node(tmp_path: Path) -> N
     builder = _tubes(translation=[0.0, 0.0, 2.0])
     places = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
     turns = Rotation.from_rotvec(np.outer([0.0, 0.5, 1.0], [1.0, 0.0, 0.0]))
-    # A mirrored one is wound the other way.
+    # A mirrored instance has reversed winding.
     scales = np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0], [0.5, 0.5, 2.0]])
     turned = builder.array(np.round(turns.as_quat() * 32767.0), "i2", normalized=True)
     placed = builder.array(places)
@@ -262,7 +262,7 @@ def test_compressed_copies_of_plain_data_are_left_aside_and_not_written(tmp_path
     character = read_character(path)
     vertices = character.rest_vertices + [0.0, 0.0, 1.0]
     write_character(tmp_path / "posed.glb", character, vertices, CharacterForm.MESH)
-    # Readers that can decompress would show the copy instead of the pose.
+    # Readers that can decompress would show the compressed copy instead of the pose.
     written = GltfDocument((tmp_path / "posed.glb").read_bytes(), tmp_path).description
     assert "extensionsUsed" not in written
     assert not any("extensions" in view for view in written["bufferViews"])

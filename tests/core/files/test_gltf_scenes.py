@@ -1,4 +1,4 @@
-"""What glTF files show, against VTK's reader and against what is known of them."""
+"""The content of glTF files, against VTK's reader and known results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _joined(path: Path) -> JoinedMesh:
 
 
 def _difference_from_vtk(path: Path, clip: int | None = None, time: float = 0.0) -> float:
-    """Return the largest distance between equal corners, per height; triangles in file order."""
+    """Return the largest distance between corresponding corners, relative to the height."""
     scene = read_scene(path)
     mesh = join_parts(scene)
     poses = scene.rest if clip is None else scene.clips[clip].sample(np.array([time]))
@@ -62,7 +62,7 @@ def test_every_interpolation_agrees_with_vtk(tmp_path: Path, interpolation: str)
         if interpolation != "CUBICSPLINE":
             return values
         tangents = 0.2 * generator.normal(size=(2, *values.shape))
-        # For each key the tangent in, the value, the tangent out.
+        # For each key: in-tangent, value, out-tangent.
         return np.stack([tangents[0], values, tangents[1]], axis=1).reshape(-1, values.shape[1])
 
     turns = generator.normal(size=(3, 4))
@@ -128,7 +128,7 @@ def test_morph_targets_agree_with_vtk(tmp_path: Path) -> None:
     frames = _joined(path).posed(sample_clip(read_scene(path), "talk", None)[1])
     expected = vertices + deltas[0] + 0.25 * deltas[1] + [1.0, 2.0, 3.0]
     assert np.abs(frames[1] - expected).max() < 1e-6
-    # The weights of the node come before those of the mesh.
+    # A node's weights take precedence over the mesh's.
     builder.description["nodes"][0]["weights"] = [0.0, 1.0]
     expected = vertices + deltas[1] + [1.0, 2.0, 3.0]
     path = builder.write(tmp_path / "m.gltf")
@@ -234,7 +234,7 @@ def test_strips_and_fans_are_triangles(tmp_path: Path) -> None:
     square = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [2, 0, 0]], dtype=np.float32)
     for mode, corners, expected in (
         (5, [0, 1, 2, 3], [[0, 1, 2], [1, 3, 2]]),
-        # Two strips, joined by triangles without area.
+        # Two strips, joined by degenerate triangles.
         (5, [0, 1, 2, 2, 1, 1, 4, 3], [[0, 1, 2], [1, 3, 4]]),
         (6, [0, 1, 3, 2], [[1, 3, 0], [3, 2, 0]]),
     ):
@@ -265,10 +265,10 @@ def test_scenery_about_a_character_is_left_out(tmp_path: Path) -> None:
     nodes.append({"mesh": floor})
     nodes.append({"mesh": ring})
     nodes[2]["children"].append(len(nodes) - 1)
-    # A clip moves the whole skeleton, and what hangs beside it on the same node.
+    # A clip moves the whole skeleton, and a sibling mesh on the same node.
     nodes.append({"mesh": floor, "name": "Carried floor"})
     nodes[0]["children"].append(len(nodes) - 1)
-    # And another moves a part of its own.
+    # Another clip moves a separate part.
     nodes.append({"mesh": ring, "name": "Engine"})
     engine = {"node": len(nodes) - 1, "path": "translation", "times": [0.0, 1.0]}
     builder.animation("hum", engine | {"values": [[0.0, 9.0, 0.0], [0.0, 9.1, 0.0]]})
@@ -280,7 +280,7 @@ def test_scenery_about_a_character_is_left_out(tmp_path: Path) -> None:
     assert len(frames.weights) == len(scene.rest.weights) == 3
     assert join_parts(scene).posed(frames).shape[0] == 2
     assert len(join_parts(scene).joined) == len(alone.joined) + 2 * len(vertices)
-    # Without a skin everything is shown.
+    # Without a skin, everything is shown.
     del nodes[4]["skin"]
     assert len(read_scene(builder.write(tmp_path / "rigid.glb")).parts) == 5
 
@@ -311,7 +311,7 @@ def test_sparse_values_replace_the_stored_ones(tmp_path: Path) -> None:
     expected = vertices.copy()
     expected[places] = given
     assert np.array_equal(read_mesh(builder.write(tmp_path / "m.glb")).vertices, expected)
-    # Without a buffer view all others are zero.
+    # Without a buffer view, all other entries are zero.
     del accessor["bufferView"]
     expected[:] = 0.0
     expected[places] = given
@@ -351,7 +351,7 @@ def test_eight_influences_move_as_their_sum(tmp_path: Path) -> None:
     four = read_scene(arm(split=False).write(tmp_path / "four.glb"))
     builder = arm(split=False, n_influences=8)
     attributes = builder.description["meshes"][0]["primitives"][0]["attributes"]
-    # All weight in the second set.
+    # All weight is in the second set.
     for name in ("JOINTS", "WEIGHTS"):
         attributes[f"{name}_0"], attributes[f"{name}_1"] = (
             attributes[f"{name}_1"],
@@ -388,13 +388,13 @@ def test_weights_that_do_not_sum_to_one_are_scaled(tmp_path: Path) -> None:
     builder.add("nodes", translation=[0.0, 0.0, 4.0])
     builder.add("skins", joints=[1, 2])
     expected = vertices + [0.0, 1.0, 2.0]
-    # What nothing moves follows the first joint; the node of a skinned mesh does not count.
+    # Unweighted vertices follow the first joint; the node of a skinned mesh has no effect.
     expected[0] = vertices[0] + [0.0, 2.0, 0.0]
     assert np.abs(read_mesh(builder.write(tmp_path / "m.glb")).vertices - expected).max() < 1e-6
 
 
 def test_parts_that_share_vertices_are_joined(tmp_path: Path) -> None:
-    """Exporters give each material the indices of its faces and all the same vertices."""
+    """Exporters give each material its face indices and the same vertices."""
     builder = GltfBuilder()
     vertices, faces = tube()
     position = builder.array(vertices)
@@ -484,7 +484,7 @@ def test_arrays_named_a_thousand_times_are_refused_before_they_are_read(tmp_path
 
 
 def _zeros(builder: GltfBuilder, like: int) -> int:
-    """Add an accessor without data, as many numbers as another one has."""
+    """Add an accessor without data, with as many numbers as another one."""
     accessor = builder.description["accessors"][like]
     kept = ("componentType", "count", "type")
     return builder.add("accessors", **{name: accessor[name] for name in kept})
@@ -524,7 +524,7 @@ def test_accessors_without_data_are_zeros_with_sparse_values_on_top(tmp_path: Pa
     assert np.array_equal(np.flatnonzero(part.morphs[0].any(axis=1)), [1, 5])
     assert part.morphs[0, 5].tolist() == [0.25, 0.0, 0.0]
     assert not part.bone_of.any()
-    # The root's translation, at the origin in all of the clip.
+    # The root's translation stays at the origin throughout the clip.
     assert not scene.clips[0].sample(np.array([0.0, 0.7])).transforms[:, 0, :3, 3].any()
 
 
@@ -606,7 +606,7 @@ def test_faces_whose_corners_lie_in_a_line_are_left_out(tmp_path: Path) -> None:
     builder = arm(split=False)
     primitive = builder.description["meshes"][0]["primitives"][0]
     vertices, faces = tube()
-    # Across the bottom through its middle, and a face that is none of the tube's.
+    # Across the bottom through its middle, plus a face that is not part of the tube.
     more = np.concatenate([faces, [[len(vertices) - 2, 0, 3], [0, 8, 16]]])
     primitive["indices"] = builder.array(more.reshape(-1), "u2")
     joined = _joined(builder.write(tmp_path / "m.glb"))

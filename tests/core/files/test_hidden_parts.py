@@ -1,4 +1,4 @@
-"""Parts that the rest pose hides by scale: shown where a clip shows them, else left out."""
+"""Parts hidden by scale in the rest pose: shown if a clip shows them, else left out."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ N = len(tube()[0])
 def _with_shield(
     scale: list[float], *scales: list[float], parent: int | None = 3, clip: str = "draw"
 ) -> GltfBuilder:
-    """Add a shield, hung on the hand, with its scale at rest and at the keys of a clip."""
+    """Add a shield, parented to the hand, with its scale at rest and at the keys of a clip."""
     builder = arm(split=False)
     vertices, faces = tube()
     primitive = {
@@ -51,7 +51,7 @@ def _with_shield(
         (HIDDEN, [HIDDEN, [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]),
         ([1e-6, 1e-6, 1e-6], [[1e-6, 1e-6, 1e-6], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]),
         ([1.0, 0.0, 1.0], [[1.0, 0.0, 1.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]),
-        # Mirrored where it is shown.
+        # Mirrored when shown.
         (HIDDEN, [[-1.0, 1.0, 1.0], HIDDEN, [-1.0, 1.0, 1.0]]),
         # It pops up.
         (HIDDEN, [[0.2, 0.2, 0.2], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [1.3, 1.3, 1.3], HIDDEN]),
@@ -67,7 +67,7 @@ def test_a_prop_that_a_clip_shows_is_part_of_the_character(
     assert character.rig is not None
     assert character.rig.joint_names == ("rig:LeftArm", "rig:LeftForeArm", "rig:LeftHand")
     assert character.topology.n_faces == 2 * len(tube()[1])
-    # As where it is not hidden at rest, and its scale is not animated.
+    # Same as without hiding at rest and without animated scale.
     plain = read_character(_with_shield(scales[-2]).write(tmp_path / "plain.glb"))
     expected = scales[1] if scales[-1] == HIDDEN else scales[-1]
     if expected == scales[-2]:
@@ -114,7 +114,7 @@ def test_a_prop_that_nothing_carries_moves_as_a_joint_of_its_own(tmp_path: Path)
     assert character.rig is not None
     assert "Shield" in character.rig.joint_names
     model = RigBody.of(character)
-    # Hidden in a frame, it is not turned to anywhere.
+    # In a frame in which it is hidden, it does not turn.
     codes = model.latent_space.high - model.latent_space.low
     assert np.isfinite(codes).all()
     assert np.abs(model.known_poses[1:, model.space.joint_of_code == 3]).max() < 1e-6

@@ -1,4 +1,4 @@
-"""Two writers of one file: neither's changes are lost, and no lock files stay."""
+"""Two writers of one file: no changes are lost, and no lock files remain."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_lock_may_vanish_while_it_is_looked_at(
 
     def look(file: Path) -> None:
         looked.append(file)
-        file.unlink()  # as its last holder does
+        file.unlink()  # like its last holder
         require_regular(file)
 
     monkeypatch.setattr(safe, "require_regular", look)
@@ -133,7 +133,7 @@ def test_a_killed_writer_leaves_the_file_as_it_was_and_disturbs_no_one(tmp_path:
 
 
 def test_names_at_the_limit_of_the_file_system_are_written(tmp_path: Path) -> None:
-    # 255 bytes, far fewer characters: what is beside it while it is written must fit as well.
+    # 255 bytes, but far fewer characters: temporary files beside it must fit as well.
     path = tmp_path / ("\N{DANCER}" * 62 + "abc.obj")
     assert len(os.fsencode(path.name)) == 255
     with locked(path), atomic_write(path) as file:

@@ -1,4 +1,4 @@
-"""Feet that hang on the root, as targets of inverse kinematics, and follow their legs here."""
+"""Feet parented to the root, as IK targets, that follow their legs here."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ENDS = ("LeftFoot", "RightFoot")
 
 
 def loosened(names: tuple[str, ...] = ENDS, renamed: bool = False) -> Character:
-    """Return the body with joints that hang on nothing; their names tell nothing if renamed."""
+    """Return the body with joints without parents; if `renamed`, with meaningless names."""
     body = rigged_body()
     assert body.rig is not None
     parents, joint_names = body.rig.parents.copy(), list(body.rig.joint_names)
@@ -94,7 +94,7 @@ def test_a_pose_is_written_for_the_tree_of_the_file(model: RigBody, tmp_path: Pa
 
 
 def test_limbs_as_they_should_be_stay_as_they_are(tmp_path: Path) -> None:
-    # One limb alone that hangs on nothing is no end of another: it has no knee above it.
+    # A single limb without a parent is not the end of another: it has no knee above it.
     for name, body in {"whole": rigged_body(), "leg": loosened(("LeftUpLeg",))}.items():
         character = read_character(write_gltf(body, tmp_path / f"{name}.glb"))
         assert character.rig is not None

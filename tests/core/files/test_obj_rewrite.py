@@ -145,7 +145,7 @@ def test_another_number_of_vertices_is_refused() -> None:
 
 
 def test_what_only_looks_like_a_vertex_is_refused() -> None:
-    # The line of the group goes on behind its backslash.
+    # The backslash continues the group's line.
     odd = b"v 0 0 0\nv 1 0 0\ng a \\\nv 9 9 9\nv 0 1 0\nf 1 2 3\n"
     assert rewritten(odd, obj.read(BytesIO(odd)).vertices) == odd
     with pytest.raises(MeshFileError, match="export the mesh again"):
@@ -162,6 +162,6 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert not target.exists()
     rewrite_obj(target, source, CORNERS * 2.0)
     assert target.read_bytes() == rewritten(CUBE, CORNERS * 2.0)
-    # Over itself, too.
+    # Also onto itself.
     rewrite_obj(source, source, CORNERS * 2.0)
     assert source.read_bytes() == target.read_bytes()

@@ -1,4 +1,4 @@
-"""Files whose buffers meshopt or Draco compresses, and quantised numbers."""
+"""Files with buffers compressed by meshopt or Draco, and quantised numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lcollision_core.files.gltf.schema import GltfDocument
 from tests.core.gltf_builder import GltfBuilder, arm, tube
 
 VECTORS = json.loads((Path(__file__).parents[2] / "data" / "meshopt.json").read_text())
-"""Buffers that meshoptimizer 1.3 encoded, and what its own decoder makes of them."""
+"""Buffers encoded by meshoptimizer 1.3, and the output of its own decoder."""
 
 _MESHOPT, _DRACO = "EXT_meshopt_compression", "KHR_draco_mesh_compression"
 
@@ -50,7 +50,7 @@ def test_damaged_buffers_are_refused_or_decoded_to_as_many_bytes(vector: dict[st
 
 
 def _verbatim(rows: np.ndarray) -> bytes:
-    """Encode up to 256 rows of bytes as meshopt does, without saving any."""
+    """Encode up to 256 rows of bytes in meshopt's format, without compression."""
     n = len(rows)
     n_groups = -(-n // 16)
     deltas = np.diff(rows.astype(np.int64), axis=0, prepend=0).astype(np.int8).astype(np.int64)
@@ -62,7 +62,7 @@ def _verbatim(rows: np.ndarray) -> bytes:
 
 
 def _with_meshopt() -> GltfBuilder:
-    """Return the arm, the vertices of which are compressed, and stand in no other buffer."""
+    """Return the arm with vertices that exist only in a compressed buffer."""
     builder = arm()
     accessor = builder.description["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
     number = builder.description["accessors"][accessor]["bufferView"]
@@ -80,7 +80,7 @@ def _with_meshopt() -> GltfBuilder:
 
 
 def _write(builder: GltfBuilder, path: Path) -> Path:
-    """Write a .gltf file with a second buffer that stands for compressed data."""
+    """Write a .gltf file with a second, placeholder buffer for compressed data."""
     described = json.loads(builder.write(path).read_text())
     described["buffers"].append({"byteLength": len(builder.blob)})
     path.write_text(json.dumps(described))
@@ -103,7 +103,7 @@ def test_meshes_of_meshopt_are_read_and_written_plain(tmp_path: Path) -> None:
 
 
 def _with_draco(packed: bytes | None = None) -> GltfBuilder:
-    """Return the arm, whose vertices and faces Draco holds alone, in their order."""
+    """Return the arm with vertices and faces that exist only in Draco's data, in order."""
     builder = arm(split=False)
     if packed is None:
         packed = DracoPy.encode(*tube(), quantization_bits=20, preserve_order=True)

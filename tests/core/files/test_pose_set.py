@@ -53,7 +53,7 @@ def test_folder_is_read_in_natural_order(tmp_path: Path, suffix: str) -> None:
     pose_set = read_pose_set(_write_folder(tmp_path, suffix=suffix), job)
     assert pose_set.names == tuple(f"mesh{pose}{suffix}" for pose in range(12))
     assert pose_set.vertices.dtype == np.float64
-    if suffix == ".stl":  # vertices are numbered as they first appear: 0, 2, 1, 3
+    if suffix == ".stl":  # vertices are numbered by first appearance: 0, 2, 1, 3
         assert np.array_equal(pose_set.vertices, _poses(12)[:, [0, 2, 1, 3]])
         assert "in 11 of 12 files" in " ".join(pose_set.notes)
     else:
@@ -189,7 +189,7 @@ def test_a_pose_in_another_unit_or_order_of_vertices_is_refused(
 
 
 def test_two_wrong_poses_of_four_do_not_hide_each_other(tmp_path: Path) -> None:
-    """Of four poses one is too large and one shuffled: the two right ones say what is right."""
+    """Of four poses, one is too large and one shuffled: the two valid ones decide."""
     tube = bending_tube(n_poses=4)
     vertices = tube.vertices.copy()
     vertices[0] *= 100.0
@@ -465,7 +465,7 @@ def test_audit_of_a_sound_mesh() -> None:
 
 
 def test_audit_finds_every_defect_at_index_zero_too() -> None:
-    # Face 0 flat, vertex 1 a bow tie, vertex 4 on vertex 0, vertex 5 in no face, edges open.
+    # Face 0 is degenerate, vertex 1 a bow tie, 4 coincides with 0, 5 is unused, edges are open.
     vertices = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 0], [9, 9, 9.0]])
     audit = audit_mesh(Topology([[0, 1, 2], [4, 1, 3]], 6), vertices)
     assert audit == (

@@ -1,4 +1,4 @@
-"""Characters from files: what is joined, the rig, its parts and its clips."""
+"""Characters from files: joined vertices, the rig, its parts and its clips."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_the_rig_poses_the_rest_pose_and_all_frames(tmp_path: Path) -> None:
 
 
 def test_the_rest_pose_is_where_the_nodes_are_stored(tmp_path: Path) -> None:
-    """Not the bind pose: the forearm is bent, and the whole moved."""
+    """Unlike in the bind pose, the forearm is bent, and the whole character is moved."""
     character = read_character(arm(split=False).write(tmp_path / "arm.glb"))
     vertices, _ = tube()
     upper = vertices[:, 1] <= 0.5
@@ -166,7 +166,7 @@ def test_a_mesh_that_hangs_on_a_joint_follows_it(tmp_path: Path) -> None:
     assert frames.transforms is not None
     for posed, transforms in zip(frames.vertices, frames.transforms, strict=True):
         assert np.abs(_skinned(rig, transforms) - posed).max() < 1e-12
-    # One that moves by itself is a joint.
+    # A node that moves by itself is a joint.
     builder.animation(
         "draw",
         {"node": 5, "path": "translation", "times": [0.0, 1.0], "values": [[0, 0, 0], [0, 1, 0]]},

@@ -1,4 +1,4 @@
-"""Body models of the SMPL family: decoded by the paper's equations, and derived by differences."""
+"""SMPL body models against the paper's equations, and derivatives against differences."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.smpl_files import (
 )
 
 SAME = 1e-7
-"""Metres. What poses add is kept in single precision."""
+"""Tolerance in metres: pose blend shapes are stored in single precision."""
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_poses_are_those_of_the_papers_equations(tmp_path: Path, n_joints: int) 
         back = space.turns_of(pose)
         np.testing.assert_allclose(back[0], turned, atol=1e-12)
         np.testing.assert_allclose(back[1], shift, atol=1e-12)
-    # What poses add matters: without it the skin is elsewhere by millimetres.
+    # Pose blend shapes matter: without them the skin is off by millimetres.
     plain = arrays | {"posedirs": 0.0 * arrays["posedirs"]}
     assert np.abs(found[0] - linear_blend_skinning(plain, betas, turns[0], shifts[0])).max() > 1e-3
 
@@ -79,7 +79,7 @@ def test_derivatives_are_those_of_differences(space: RigPoseSpace) -> None:
     step = 1e-6 * np.eye(len(codes))
     forth, back = (space.decode_some(codes + move, chosen) for move in (step, -step))
     by_codes = (forth - back) / 2e-6
-    # But for the ends of fingers, which have no skin in so coarse a mesh.
+    # Except the ends of fingers, which have no skin in such a coarse mesh.
     assert (np.abs(by_codes).max(axis=(1, 2)) > 1e-4).mean() > 0.8
     np.testing.assert_allclose(space.tangents(codes, chosen), by_codes, atol=1e-8)
     generator = np.random.default_rng(5)
@@ -87,7 +87,7 @@ def test_derivatives_are_those_of_differences(space: RigPoseSpace) -> None:
     by_vertices[:, chosen] = generator.normal(size=(4, len(chosen), 3))
     expected = np.einsum("mnx,dnx->md", by_vertices[:, chosen], by_codes)
     np.testing.assert_allclose(space.pull_back(codes, by_vertices), expected, atol=1e-6)
-    # Elbows and knees are bent enough not to be taken as more so.
+    # Bend elbows and knees beyond the least bend that slopes are computed at.
     codes[space._hinges] = np.abs(codes[space._hinges]) + 0.5
     mean = csr_matrix(
         (np.full(3, 1.0 / 3.0), ([0] * 3, chosen[:3])), shape=(1, len(by_vertices[0]))

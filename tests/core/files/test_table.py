@@ -1,4 +1,4 @@
-"""The one list of extensions."""
+"""The single table of file extensions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CORE = Path(lcollision_core.__file__).parent
 @pytest.mark.parametrize("suffix", FILES)
 def test_readers_and_writers_of_the_table_are_there(suffix: str) -> None:
     kind = FILES[suffix]
-    # Printers alone read what is only printed.
+    # Print formats need no reader.
     assert kind.holds is Holds.PRINT or callable(function_of(kind.reader))
     assert not kind.writer or callable(function_of(kind.writer))
 

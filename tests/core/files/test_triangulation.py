@@ -32,14 +32,14 @@ CONVEX = [(0, 0), (2, -1), (4, 0), (4, 3), (1, 4)]
 
 
 def _cut(outline: Points, turn: Rotation | None = None, scale: float = 1.0) -> Triangulation:
-    """Triangulate one polygon with corners 0, 1, 2 ... in any plane."""
+    """Triangulate a polygon with corners 0, 1, 2 ... in any plane."""
     points = np.column_stack([np.asarray(outline, dtype=float), np.zeros(len(outline))])
     points = (points if turn is None else turn.apply(points)) * scale
     return triangulate(Polygons(points, np.array([len(points)]), np.arange(len(points))))
 
 
 def _areas(outline: Points, faces: np.ndarray) -> np.ndarray:
-    """Return the signed areas of triangles, of the sign of the outline's."""
+    """Return the areas of triangles, positive if oriented like the outline."""
     a, b, c = np.asarray(outline, dtype=float)[faces.T]
     areas = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
     return areas * np.sign(areas.sum())
@@ -63,7 +63,7 @@ def _assert_covers(outline: Points, faces: np.ndarray) -> None:
         DART,
         KEYHOLE,
         TOUCHING,
-        # Corners in line, and at one place.
+        # Collinear and coincident corners.
         [(0, 0), (1, 0), (2, 0), (4, 0), (1, 1), (0, 4), (0, 2)],
         [(0, 0), (4, 0), (4, 0), (1, 1), (1, 1), (1, 1), (0, 4), (0, 4)],
     ],
@@ -83,7 +83,7 @@ def test_every_start_and_plane_of_a_concave_polygon(
 
 @st.composite
 def simple_polygons(draw: st.DrawFn) -> list[tuple[float, float]]:
-    """Draw a polygon that is seen whole from within, with corners in line or at one place."""
+    """Draw a star-shaped polygon, with collinear or coincident corners."""
     n = draw(st.integers(4, 20))
     radii = draw(st.lists(st.integers(1, 8), min_size=n, max_size=n))
     angles = 2.0 * np.pi * (np.arange(n) + 0.5) / n
@@ -109,7 +109,7 @@ def test_any_simple_polygon_is_covered(outline: list[tuple[float, float]]) -> No
 def test_a_convex_polygon_is_the_fan_round_its_first_corner(first: int) -> None:
     outline = [*CONVEX[first:], *CONVEX[:first]]
     for turn in Rotation.random(20, random_state=0):
-        # Decimals make a corner in line reflex by their rounding.
+        # Decimal rounding makes a collinear corner reflex.
         cut = _cut(
             [
                 *outline,
@@ -185,7 +185,7 @@ def test_polygons_that_name_no_vertex_or_are_not_finite_are_refused_by_name(tmp_
             read_mesh(tmp_path / "a.obj")
 
 
-# A part with a notch, its two caps concave, and a rod in the notch that touches nothing.
+# A part with a notch and two concave caps, and a rod in the notch that touches nothing.
 _RING = np.array(NOTCHED, dtype=float)
 _ROD = np.array([(1.3, 1.8), (1.7, 1.8), (1.7, 2.2), (1.3, 2.2)])
 CLAMP = np.concatenate(
@@ -242,7 +242,7 @@ def _n_pairs(vertices: np.ndarray, topology: Topology) -> int:
 
 
 def _closed() -> np.ndarray:
-    """Return the clamp with its notch turned outwards, so that its caps are convex."""
+    """Return the clamp with its notch bulging outwards, so that its caps are convex."""
     points = CLAMP.copy()
     points[[3, 4, 5, 6, 11, 12, 13, 14], 1] = [3.2, 3.4, 3.4, 3.2] * 2
     return points
@@ -255,7 +255,7 @@ def test_a_rod_in_a_notch_collides_with_nothing(tmp_path: Path, suffix: str, tur
     mesh = read_mesh(_write_clamp(tmp_path / f"clamp{suffix}", turned))
     assert mesh.topology.is_watertight
     assert _n_pairs(mesh.vertices, mesh.topology) == 0
-    # The rod in the bottom of the notch.
+    # The rod penetrates the bottom of the notch.
     moved = CLAMP.copy()
     moved[16:, 1] -= 1.5
     assert _n_pairs(moved, mesh.topology) > 0
@@ -272,7 +272,7 @@ def test_the_reference_of_a_set_decides_for_all_its_poses(tmp_path: Path, suffix
         assert alone[0] != alone[1]
         poses = read_pose_set(tmp_path)
         assert poses.topology == alone[0]
-        # As one mesh for a model of the set.
+        # As a single mesh, for a model of the set.
         again = read_mesh(files[1], topology=poses.topology)
         assert again.topology is poses.topology
         assert np.array_equal(again.vertices, poses.vertices[1])
@@ -348,7 +348,7 @@ def test_a_triangle_with_two_equal_corners_is_left_out_and_named(
     corners = mesh.vertices[mesh.topology.faces]
     np.testing.assert_allclose(corners, CLAMP[[[0, 1, 2], [2, 1, 3]]], atol=1e-6)
     assert "face 1 (from 0), which has two equal corners, was left out" in mesh.notes
-    # A pose of the same body is cut as it was.
+    # A pose of the same body is triangulated equally.
     assert read_mesh(path, topology=mesh.topology).topology is mesh.topology
     result = lcollision("check", path)
     assert result.exit_code == 0

@@ -23,7 +23,7 @@ def _joined(strips: list[list[int]]) -> list[int]:
 
 
 def _ply(path: Path, rows: list[list[int]], order: str, faces: list[list[int]] = ()) -> Path:
-    """Write strips, and faces before them, as text or as binary of either byte order."""
+    """Write strips, and faces before them, as text or as binary in either byte order."""
     name = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
     header = [f"ply\nformat {name} 1.0", f"element vertex {len(VERTICES)}"]
     header += [f"property double {axis}" for axis in "xyz"]
@@ -50,7 +50,7 @@ def _ply(path: Path, rows: list[list[int]], order: str, faces: list[list[int]] =
         [_joined(STRIPS + SECOND)],
         [_joined(STRIPS)[:-1], _joined(SECOND)],
         [*STRIPS, [], *SECOND, [-1], [0, 1]],
-        # Strips joined by triangles that name a vertex twice.
+        # Strips joined by degenerate triangles.
         [[*STRIPS[0], 4, 0, *STRIPS[1], -1, *STRIPS[2]], *SECOND],
     ],
 )

@@ -1,4 +1,4 @@
-"""A posed character in its own file: what moved, and that nothing else did."""
+"""A posed character in its own file: moved parts, and nothing else changed."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _space(character: Character) -> RigPoseSpace:
 
 
 def _pose(character: Character) -> tuple[np.ndarray, np.ndarray]:
-    """Return a pose in which every joint and the whole turn: vertices and transforms."""
+    """Return vertices and transforms of a pose in which all joints and the body turn."""
     space = _space(character)
     codes = np.random.default_rng(1).uniform(-0.4, 0.4, len(space.low))
     codes[space.are_shapes] = 0.0
@@ -85,17 +85,17 @@ def test_clips_that_are_kept_play_as_they_did_beside_the_pose(
     assert np.abs(again.rest_vertices - vertices).max() < 1e-5 * size
     assert list(again.clips.items()) == list(character.clips.items())
     assert character.file is not None
-    # The camera's shows the pose.
+    # The camera's clip shows the pose.
     for name in ("wave", "walk"):
         before, after = (one.sample(name, None) for one in (character, again))
         np.testing.assert_array_equal(after.times, before.times)
         assert np.abs(after.vertices - before.vertices).max() < 1e-6 * size
-    # Each key of the source is there as it was.
+    # Every key of the source is unchanged.
     old, new = (described(file)[0]["animations"] for file in (character.source, path))
     for was, now in zip(old, new, strict=True):
         assert now["channels"][: len(was["channels"])] == was["channels"]
         assert now["samplers"][: len(was["samplers"])] == was["samplers"]
-    # It is known by its rules, with the clips in it.
+    # The file is recognised, with its rules and clips.
     own = read_own_file(open_scene(path))
     assert own is not None
     np.testing.assert_allclose(own.vertices, again.rest_vertices, atol=1e-9)
@@ -221,7 +221,7 @@ def test_an_untouched_frame_is_the_source(
                 written = vectors(path, other["attributes"][name])
                 stored = vectors(Path(character.source), one["attributes"][name])
                 assert np.abs(written - stored).max() < 1e-6
-    # What hangs on a joint and has not moved is not touched.
+    # An unmoved child of a joint is not changed.
     assert after["nodes"][6] == before["nodes"][6]
 
 
@@ -288,7 +288,7 @@ def test_a_static_mesh_says_that_it_loses_its_morph_targets(tmp_path: Path) -> N
         n = builder.description["accessors"][primitive["attributes"]["POSITION"]]["count"]
         primitive["targets"] = [{"POSITION": builder.array(np.full((n, 3), 0.1))}]
     mesh["extras"] = {"targetNames": ["smile"], "kept": 1}
-    # A hat that no joint moves keeps its own.
+    # A hat that no joint moves keeps its own morph target.
     builder.add("nodes", name="Stand", mesh=2, translation=[3.0, 0.0, 0.0])
     builder.description["nodes"][6].pop("mesh")
     group = {"name": "joy", "binds": [{"mesh": 1, "index": 0}, {"mesh": 2, "index": 0}]}
@@ -357,7 +357,7 @@ def test_normals_turn_with_the_pose_and_agree_at_seams(
     for vertex in np.unique(joined):
         at_seam = normals[joined == vertex]
         assert np.abs(at_seam - at_seam[0]).max() < 1e-6
-    # Those of the sides still point away from the axis, which goes through the middle of each ring.
+    # Normals of the sides still point away from the axis through the middle of each ring.
     vertices_in_file = vertices[joined]
     unposed = split_corners(*tube())[0]
     for height in np.unique(unposed[:, 1]):
@@ -450,7 +450,7 @@ def test_a_source_that_changed_is_refused(character: Character, tmp_path: Path) 
     other.write(Path(character.source))
     with pytest.raises(MeshFileError, match="is not the file that the character was read from"):
         write_character(tmp_path / "posed.glb", character, vertices, "mesh")
-    # Its vertices may merely have moved.
+    # It is also refused if only its vertices have moved.
     other = figure()
     other.description["nodes"][1]["translation"] = [0.0, 1.0, -50.0]
     other.write(Path(character.source))
@@ -488,11 +488,11 @@ def test_damage_that_reading_passes_over_is_one_sentence(
 
 
 def _shaped(**transforms: Any) -> GltfBuilder:
-    """Build the figure, some of its nodes scaled, or placed by a matrix, in the rest pose."""
+    """Build the figure with some nodes scaled, or placed by a matrix, in the rest pose."""
     builder = figure()
     nodes = builder.description["nodes"]
     for number in (1, 2, 3):
-        # Not along the axes of what is above.
+        # Not along the parent's axes.
         nodes[number]["rotation"] = rotation(number % 3, 0.7)
     for node in nodes:
         node |= transforms.get(node["name"], {})
@@ -575,7 +575,7 @@ def test_what_joints_cannot_hold_is_written_as_a_mesh_and_said(tmp_path: Path) -
     assert again.rig is None
     in_file = again.rest_vertices[again.joined]
     assert np.abs(in_file - vertices[character.joined]).max() < 1e-6
-    # A joint above it can turn.
+    # A joint above it can be turned.
     space = _space(character)
     codes = np.where(space.joint_of_code == 0, 0.3, 0.0)
     turned = space.decode(codes[None])[0] * space.body_size
