@@ -1,4 +1,4 @@
-"""The page on the architecture names what is there."""
+"""The architecture page matches the code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rules of the house that no tool checks."""
+"""House rules that no tool checks."""
 
 from __future__ import annotations
 

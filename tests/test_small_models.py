@@ -1,4 +1,4 @@
-"""The files in `tests/data` are what their code makes."""
+"""The files in `tests/data` match the code that makes them."""
 
 from __future__ import annotations
 
@@ -18,6 +18,6 @@ def test_the_stored_files_are_what_is_made_anew(tmp_path: Path) -> None:
         assert old.card == new.card
         assert old.topology == new.topology
         known = [model.embedding.decode(model.known_poses) for model in (old, new)]
-        # Training adds in another order on other processors.
+        # The order of summation in training depends on the processor.
         np.testing.assert_allclose(known[0], known[1], atol=1e-3)
         assert np.ptp(known[0], axis=0).max() > 0.5

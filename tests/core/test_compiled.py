@@ -1,4 +1,4 @@
-"""Compiled loops run wherever the program is installed."""
+"""Compiled loops work wherever the program is installed."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_seconds_of_compiling_are_added_up_and_those_of_running_are_not(tmp_path
 def test_a_loop_runs_where_nothing_can_be_cached(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A file in the folder's place keeps even root from writing there.
+    # A file instead of the folder keeps even root from writing there.
     (tmp_path / "__pycache__").write_text("")
     for variable in ("HOME", "XDG_CACHE_HOME", "LOCALAPPDATA"):
         monkeypatch.setenv(variable, str(tmp_path / "__pycache__"))

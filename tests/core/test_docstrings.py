@@ -1,4 +1,4 @@
-"""The examples in docstrings run and print what they say."""
+"""The examples in docstrings run and print the stated output."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def test_examples_in_docstrings() -> None:
     attempted = 0
     for module in pkgutil.walk_packages(lcollision_core.__path__, "lcollision_core."):
         imported = importlib.import_module(module.name)
-        # For each object, doctest looks through all modules that any test has imported.
+        # For each object, doctest searches all modules that any test has imported.
         if ">>>" not in inspect.getsource(imported):
             continue
         result = doctest.testmod(imported)

@@ -1,4 +1,4 @@
-"""Every error's sentence is composed from its fields, which reach other processes unchanged."""
+"""Every error's sentence is built from its fields, which reach other processes unchanged."""
 
 import pickle
 

@@ -1,4 +1,4 @@
-"""The scripts of docs/examples, as people run them."""
+"""The scripts of docs/examples, run as users do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""JSON values as typed objects: what fits, and the sentence for what does not."""
+"""JSON values as typed objects: valid values, and sentences for invalid ones."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_values_come_back_as_their_types() -> None:
     whole = Whole((Part("a"), Part("b", 2.0, "y")), (0.5,), None, {"by": [1, "x"]})
     assert from_json(Whole, to_json(whole), "whole") == whole
     assert from_json(Whole, {"parts": [], "weights": [1], "later": 3}, "whole") == Whole((), (1.0,))
-    # A file name that is no text, as an older version kept it.
+    # A file name that is not valid text, as stored by an older version.
     assert from_json(Part, {"name": "\udcffbend"}, "part").name == "?bend"
 
 

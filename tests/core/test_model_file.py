@@ -1,4 +1,4 @@
-"""The model file: what comes back, and what is refused."""
+"""The model file: round trips and refusals."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def _resave(path: Path, change: dict[str, object]) -> None:
-    """Rewrite the file with another JSON document, its tensors as they are."""
+    """Rewrite the file with another JSON document and the same tensors."""
     content = path.read_bytes()
     header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
     document = json.loads(header["__metadata__"]["lcollision"]) | change
@@ -134,7 +134,7 @@ def test_damage_is_refused_or_harmless(path: Path, data: st.DataObject) -> None:
         sections = read_model_file(path)
     except ModelFileError:
         return
-    # A space of the header's padding may have become a newline.
+    # A padding space of the header may have become a newline.
     assert _equal(sections, _sections())
 
 
@@ -227,7 +227,7 @@ def test_numbers_that_are_not_finite_are_neither_written_nor_read(
     with pytest.raises(ModelFileError, match=r"embedding/weights.*not finite"):
         write_model_file(path, sections)
     assert list(tmp_path.iterdir()) == []
-    # A program without that check must not be able to hand one over either.
+    # A program without that check must not be able to pass one on either.
     monkeypatch.setattr("lcollision_core.model_file._require_storable", lambda *_: None)
     write_model_file(path, sections)
     with pytest.raises(ModelFileError, match=r"embedding/weights.*not finite"):

@@ -1,4 +1,4 @@
-"""Labelling on a Dask cluster says the same as labelling here, and fails in sentences."""
+"""Labelling on a Dask cluster gives the same rows as here, and fails in sentences."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_worker_of_another_version_is_refused(
 def test_workers_that_come_late_are_asked_for_their_version(
     scheduler: str, labeller: Labeller, tmp_path: Path
 ) -> None:
-    """As if it had come late: it changes after the first chunk."""
+    """Simulated by a version that changes after the first chunk."""
 
     def change(found: str) -> None:
         labelling_run.version = lambda _: found  # type: ignore[assignment]

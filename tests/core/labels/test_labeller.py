@@ -1,4 +1,4 @@
-"""Exact labels: how samples are drawn, and what is said of them."""
+"""Exact labels: drawing samples and labelling them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PINNED_BITS = [12324809925222472078, 2472481397521176968]
 
 
 def test_the_samples_of_a_seed_never_change() -> None:
-    """A store that an older program began must go on with the same rows."""
+    """A store begun by an older version must continue with the same rows."""
     box = LatentBox(np.array([0.0, -2.0]), np.array([1.0, 2.0]))
     first = box.draw(7, 11)[0]
     bits = np.random.Philox(np.random.SeedSequence([7, 11])).random_raw(2)
@@ -47,7 +47,7 @@ def test_samples_fill_the_box_evenly() -> None:
     assert place.min() >= 0.0
     assert place.max() <= 1.0 + 1e-6
     shares = np.stack([np.histogram(column, 8, (0, 1))[0] for column in place.T]) / len(place)
-    # Five standard deviations of a share of 1/8 among 6400.
+    # Five standard deviations of a share of 1/8 in 6400.
     assert np.abs(shares - 0.125).max() < 5 * np.sqrt(0.125 * 0.875 / len(place))
     assert np.abs(np.corrcoef(place.T) - np.eye(3)).max() < 5 / np.sqrt(len(place))
 
@@ -74,7 +74,7 @@ def test_labels_are_those_of_the_exact_check_of_the_exported_mesh(
 
 @pytest.mark.parametrize("n_touched", [0, 1, 7, 8, 100, 129, 300])
 def test_energies_are_summed_to_the_bit_as_numpy_sums_them(n_touched: int) -> None:
-    """Stores that NumPy's sums began go on with the same rows."""
+    """Stores begun with NumPy's sums continue with the same rows."""
     rng = np.random.default_rng(n_touched)
     shares = rng.random((3, 400)).astype(np.float32)
     energy = np.zeros((2, 400))
@@ -150,9 +150,9 @@ def test_mixed_samples_are_of_the_box_of_known_poses_and_at_the_border(
     of_box = is_of_box(np.arange(640), Draws.MIXED)
     assert of_box.mean() == 0.5
     assert np.array_equal(rows.latent[of_box], plain.latent[of_box])
-    # Each row of a block is labelled as it would be alone.
+    # Each row of a block gets the same label as alone.
     assert as_bytes(mixed.label(rows.latent[:64])) == as_bytes(rows.taken(slice(64)))
-    # Bisections end nearer to what is just not free.
+    # Bisections end nearer to the collision boundary.
     at_border, inside = place >= 24, of_box & rows.colliding
     assert 0.1 < rows.colliding[at_border].mean() < 0.9
     assert np.median(rows.energy[at_border & rows.colliding]) < np.median(rows.energy[inside])
@@ -170,7 +170,7 @@ def test_a_part_of_a_mixed_block_is_that_of_the_whole(tube_model: LearnedBody) -
 def test_no_mixed_training_row_depends_on_one_that_measures(
     tube_model: LearnedBody, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bisections start between rows that are not held out."""
+    """Bisections use only rows that are not held out."""
     labeller = tube_model.labeller(Draws.MIXED)
     ends: list[LabelRows] = []
 
@@ -187,7 +187,7 @@ def test_no_mixed_training_row_depends_on_one_that_measures(
 
 
 def test_where_nothing_collides_the_box_fills_a_mixed_block(tube_model: LearnedBody) -> None:
-    """By rules that tolerate any depth."""
+    """With rules that tolerate any depth."""
     rules = ContactRules(tolerated_depth=0.5)
     labeller = replace(tube_model.labeller(Draws.MIXED), rules=rules)
     rows = labeller.label_rows(SEED, range(ROWS_PER_BLOCK))

@@ -1,4 +1,4 @@
-"""Labelling runs: all give the same files, go on where another ended, and tell how far they are."""
+"""Labelling runs: equal files, resuming, and progress."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_two_runs_at_once_give_the_same_files(
 def test_no_more_than_two_blocks_a_thread_are_begun_beyond_the_chunk_in_work(
     labeller: Labeller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a kill may cost: the rows of finished blocks whose chunk is not written."""
+    """A kill loses at most the rows of finished blocks whose chunk is not written."""
     begun: list[int] = []
     label_rows = Labeller.label_rows
 

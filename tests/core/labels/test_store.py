@@ -1,4 +1,4 @@
-"""The label store: what survives an interruption, what is noticed, what is refused."""
+"""The label store: interruptions, damage and refusals."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def test_a_chunk_that_is_not_whole_is_noticed_and_labelled_again(
         with pytest.raises(MeshFileError, match=f"{MIDDLE} cannot be written: .* not a plain"):
             label_poses(labeller, path, 5, seed=SEED)
         return
-    # However few are asked for: what was there before is there again.
+    # Even if fewer rows are requested, the previous rows are restored.
     assert label_poses(labeller, path, 5, seed=SEED).labelled == ROWS_PER_CHUNK
     assert as_bytes(LabelStore.open(path).load()) == as_bytes(ground_truth)
     assert LabelStore.open(path).check() == ()
@@ -193,7 +193,7 @@ def test_every_flipped_bit_is_noticed_or_harmless(
 def test_a_run_that_is_killed_while_it_writes_leaves_the_rows_before(
     path: Path, labeller: Labeller, ground_truth: LabelRows, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The chunk was there before, with fewer rows."""
+    """The chunk already existed, with fewer rows."""
 
     def die(*_: object, **__: object) -> None:
         raise KeyboardInterrupt

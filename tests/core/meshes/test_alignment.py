@@ -57,7 +57,7 @@ def test_an_arm_that_is_a_fifth_of_the_body_does_not_tilt_it() -> None:
     assert alignment.weights[torso].min() > 0.99
     assert alignment.weights[arm[1:]].max() < 1e-6
     plain, _ = fit_rigid(poses, body)
-    assert np.abs(plain - np.eye(3)).max() > 0.05  # the arm does tilt an unweighted fit
+    assert np.abs(plain - np.eye(3)).max() > 0.05  # the arm tilts an unweighted fit
 
 
 def test_alignment_does_not_depend_on_where_poses_stand() -> None:
@@ -177,7 +177,7 @@ def test_height_and_up_axis_are_the_longest_side() -> None:
 
 
 def _calm_motion(vertices: np.ndarray) -> float:
-    """Return how far the calmest tenth of the body strays from its mean position, normalised."""
+    """Return the normalised deviation of the stillest tenth of the body from its mean position."""
     spread = np.sqrt(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=2).mean(axis=0))
     return float(np.quantile(spread, 0.1)) / body_size(vertices[0])
 

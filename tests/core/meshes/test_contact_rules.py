@@ -1,4 +1,4 @@
-"""Contact rules as values: what is refused, what a file holds, and what a verdict says."""
+"""Contact rules as values: refusals, file contents and wording."""
 
 from __future__ import annotations
 

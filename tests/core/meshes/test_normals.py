@@ -1,4 +1,4 @@
-"""Vertex normals against hand-worked ones and the definition."""
+"""Vertex normals against values by hand and the definition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names of body parts for the joints of rigs of several programs."""
+"""Body part names for joints of rigs from several programs."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_the_legs_of_an_animal_with_four_are_apart() -> None:
     assert part_names(names) == (
         "Right hind thigh", "Right hind shin", "Right front foot", "Left front foot"
     )  # fmt: skip
-    # A forearm is none of them, nor is a helper at the front of a thigh.
+    # A forearm is not one of them, nor a helper at the front of a thigh.
     names = ["L Fore Arm", "R Fore Arm", "thigh_front_helper.L", "thigh.L"]
     assert part_names(names) == ("Left forearm", "Right forearm", "Left thigh", "Left thigh")
 
@@ -75,7 +75,7 @@ def test_an_arm_is_the_upper_one_only_where_there_is_a_forearm() -> None:
     assert part_names(["LeftArm", "LeftForeArm", "LeftLeg", "LeftUpLeg"]) == (
         "Left upper arm", "Left forearm", "Left shin", "Left thigh"
     )  # fmt: skip
-    # So is a shoulder, unless the rig names the upper arm.
+    # So is a shoulder joint, unless the rig names the upper arm.
     assert part_names(["clavicle_l", "shoulder_l", "elbow_l", "shoulder_r"]) == (
         "Left shoulder", "Left upper arm", "Left forearm", "Right shoulder"
     )  # fmt: skip
@@ -124,13 +124,13 @@ def test_a_body_of_one_name_is_many_parts() -> None:
 
 
 def test_of_hundreds_of_unknown_joints_each_chain_is_one_part() -> None:
-    # A trunk of which ten chains of six hang.
+    # A trunk with ten chains of six joints.
     names = [f"Bone.{joint:03d}" for joint in range(61)]
     parents = np.array([-1, *(0 if joint % 6 == 0 else joint for joint in range(60))])
     labels = joint_labels(names, parents)
     assert labels[:8] == ("Bone.000", *["Bone.001"] * 6, "Bone.007")
     assert len(set(labels)) == 11
-    # Few are told apart one by one, and so are the pieces of a snake.
+    # A few joints are distinguished individually, like the pieces of a snake.
     assert len(set(joint_labels(names[:13], parents[:13]))) == 13
     assert len(set(joint_labels(names[:40], np.arange(40) - 1))) == 40
     assert joint_labels(names, np.arange(61) - 1)[:4] == (

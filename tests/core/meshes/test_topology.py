@@ -51,7 +51,7 @@ def test_fans_that_touch_in_a_vertex_alone_pinch_it() -> None:
 
 
 def _fans(faces: np.ndarray, vertex: int) -> int:
-    """Count the fans round a vertex by growing each from any face."""
+    """Count the fans around a vertex by growing each from any of its faces."""
     left = [set(face.tolist()) for face in faces if vertex in face]
     fans = 0
     while left:

@@ -1,4 +1,4 @@
-"""Which way is up: people, a quadruped, and shapes that do not tell."""
+"""The up axis of people, a quadruped, and ambiguous shapes."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from tests.core.shapes import Mesh, box, join, sphere
 
 BODY = Path(__file__).parents[3] / "resources" / "poses" / "body.npz"
 TURNS = {0: [1, 2, 0], 1: [0, 1, 2], 2: [2, 0, 1]}
-"""Orders of the axes, all right-handed, that bring y to x, y and z."""
+"""Right-handed permutations of the axes that move y to x, y and z."""
 
 
 def divided(mesh: Mesh, times: int = 3) -> Mesh:
-    """Cut each face into four, a few times, so that points lie everywhere."""
+    """Subdivide each face into four, several times, so that points cover the surface."""
     vertices, faces = mesh.vertices, mesh.faces
     for _ in range(times):
         a, b, c = np.moveaxis(vertices[faces], 1, 0)
@@ -32,7 +32,7 @@ def divided(mesh: Mesh, times: int = 3) -> Mesh:
 
 
 def galloping(swing: float) -> Mesh:
-    """Make a four-legged body, longer along z than it is high along y, one foot at each corner."""
+    """Make a four-legged body, longer along z than high along y, with a foot at each corner."""
     parts = [
         box([-0.25, 0.8, -1.0], [0.25, 1.3, 1.0]),
         box([-0.12, 1.2, 0.9], [0.12, 1.9, 1.2]),
@@ -64,7 +64,7 @@ def test_a_galloping_horse_stands_on_its_legs(horse: PoseSet, axis: int) -> None
 def test_people_stand_on_their_feet_whatever_they_do(axis: int) -> None:
     poses = read_pose_set(BODY)
     assert poses.up.reason == "the set says so"
-    # z is up there.
+    # In that body, z is up.
     turned = poses.vertices[:, :, np.roll([0, 1, 2], axis - 2)]
     guess = guess_up(poses.topology, turned)
     assert (guess.axis, guess.is_sure) == (axis, True)

@@ -1,4 +1,4 @@
-"""Motions that are free between frames as well, on the linear path of the vertices."""
+"""Motions that are also free between frames, on the linear path of the vertices."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from tests.core.shapes import box, join
 from tests.foreign_cloth import hits_on_counted_pairs
 
 UP = (0.0, 0.0, 1.0)
-# An arm goes farther round a trunk than it may unless that is asked for.
+# An arm must move around a trunk by more than the default largest change.
 OPTIONS = MotionOptions(
     easing=6, substeps=0, continuous=True, frame=ResolveOptions(largest_change=None)
 )
 
 
 def hits_of_ipctk(body: RigBody, motion: Motion) -> list[int]:
-    """Return after which frames ipctk, with a search of its own, finds that two tubes meet.
+    """Return the frames after which ipctk, with its own search, finds that two tubes intersect.
 
-    The body consists of tubes that do not touch at rest. They are told apart by ipctk's filter.
+    The body consists of tubes that do not touch at rest. ipctk's filter distinguishes them.
     """
     topology, check = body.topology, body.exact_check()
     mesh = ipctk.CollisionMesh(
@@ -93,7 +93,7 @@ def test_what_passes_through_between_two_free_frames_goes_round_on_all_of_the_wa
     assert hits_of_ipctk(body, found.motion) == []
     screened = screen_motion(found.motion, check, substeps=0, continuous=True)
     assert (screened.colliding, screened.collides_between) == ((), ())
-    # Where it is not asked for, nothing is said of it.
+    # Without the option, the report does not mention it.
     assert (
         resolve_motion(body.resolver, motion, UP, replace(OPTIONS, continuous=False)).touching
         is None
@@ -103,7 +103,7 @@ def test_what_passes_through_between_two_free_frames_goes_round_on_all_of_the_wa
 @pytest.mark.slow
 def test_with_a_clearance_parts_keep_it_in_frames_and_touch_nowhere_between() -> None:
     with_joints, motion = through_the_trunk()
-    # All that crosses between tubes counts, also about a joint.
+    # Every crossing between tubes counts, also around a joint.
     body = with_joints.with_rules(replace(with_joints.rules, joint_exclusion=False))
     options = replace(OPTIONS, frame=ResolveOptions(clearance=0.003, largest_change=None))
     found = resolve_motion(body.resolver, motion, UP, options)
@@ -116,7 +116,7 @@ def test_with_a_clearance_parts_keep_it_in_frames_and_touch_nowhere_between() ->
 
 @pytest.mark.slow
 def test_what_cannot_be_led_round_is_named() -> None:
-    """With all of the arm locked, nothing but the whole body could move."""
+    """With the whole arm locked, only the whole body could move."""
     body, whole = through_the_trunk()
     motion = whole.part(range(13, 15))
     locked = frozenset(range(len(body.domain_names)))
@@ -137,7 +137,7 @@ def test_some_of_a_real_clip_is_free_in_and_between_frames_as_ipctk_finds(
     found = resolve_motion(body.resolver, motion, body.space.up, options)
     assert found.after.all()
     assert found.touching == ()
-    # And then two frames as they were.
+    # Next, two unchanged frames.
     collides = np.flatnonzero(~body.exact_check().are_free(motion.codes))[-2:]
     codes = np.concatenate([found.motion.codes, motion.codes[collides]])
     both, check = Motion("both", np.arange(8.0), codes), body.exact_check()

@@ -1,4 +1,4 @@
-"""Corrections by hand: eased over the neighbours, and across the seam of a cycle."""
+"""Corrections by hand: eased over neighbouring frames, and across the seam of a cycle."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_a_correction_is_whole_at_its_frame_and_fades_over_its_neighbours() -> N
     assert (np.diff(share[15:21]) > 0.0).all()
     assert (np.diff(share[20:26]) < 0.0).all()
     np.testing.assert_allclose(share[15:20], share[25:20:-1])
-    # No step where it begins: the first share is small.
+    # There is no jump at the start: the first share is small.
     assert 0.0 < share[15] < 0.1
     outside = [frame for frame in range(N_FRAMES) if abs(frame - 20) > 5]
     assert edited.codes[outside].tobytes() == motion.codes[outside].tobytes()
@@ -31,7 +31,7 @@ def test_a_correction_is_whole_at_its_frame_and_fades_over_its_neighbours() -> N
 def test_without_easing_one_frame_changes() -> None:
     _, cycle = swinging()
     assert cycle.is_cycle
-    # A cycle's last frame is its first.
+    # A cycle's last frame equals its first.
     for motion, frames in ((cycle, [0, N_FRAMES - 1]), (cycle.part(range(40)), [0])):
         edited = corrected(motion, 0, motion.codes[0] + 0.1, easing=0)
         assert np.flatnonzero((edited.codes != motion.codes).any(axis=1)).tolist() == frames
@@ -45,7 +45,7 @@ def test_a_cycle_stays_one() -> None:
     for frame in (0, 2, N_FRAMES - 2, N_FRAMES - 1):
         edited = corrected(cycle, frame, cycle.codes[frame] + 0.1, easing=6)
         assert edited.codes[0].tobytes() == edited.codes[-1].tobytes()
-        # Across the seam too.
+        # Also across the seam.
         assert (edited.codes[1] != cycle.codes[1]).any()
         assert (edited.codes[-2] != cycle.codes[-2]).any()
         assert edited.codes[20].tobytes() == cycle.codes[20].tobytes()

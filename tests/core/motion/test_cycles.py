@@ -1,4 +1,4 @@
-"""Cycles, whose last frame is their first again: they stay so, and smooth across the seam."""
+"""Cycles, whose last frame equals the first: they stay cyclic and smooth across the seam."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ N_FRAMES = 49
 
 @cache
 def cycle() -> tuple[RigBody, Motion]:
-    """Return a body whose arm is in its trunk at the seam, and free in the middle."""
+    """Return a body and a cycle: the arm is in the trunk at the seam, and free in the middle."""
     character = swinging_body(n_frames=N_FRAMES, begin=0.5)
     body = RigBody.of(character)
     frames = character.sample(CLIP, None)
@@ -79,7 +79,7 @@ def test_a_collision_at_the_seam_is_resolved_as_any_other(
     else:
         assert found.spans == (range(N_FRAMES),)
     old, new = (body.decode(rows) / body.body_size for rows in (motion.codes, codes))
-    # The seam is no worse than what it lies between.
+    # The seam is no worse than its surroundings.
     correction = bends(new - old)
     assert 0.0 < correction[0] < 2.0 * max(correction[-4:].max(), correction[1:5].max())
     if window > N_FRAMES:
@@ -148,7 +148,7 @@ def test_spans_of_a_cycle_go_on_across_its_seam() -> None:
     assert colliding_spans(colliding, 2) == [range(4), range(8, 13)]
     assert colliding_spans(colliding, 2, None, True) == [range(8, 13), range(19, 24)]
     assert colliding_spans(colliding, 2, range(18), True) == [range(8, 13), range(20, 24)]
-    # The frame after the last is the first.
+    # The frame after the last one is the first.
     assert colliding_spans(colliding, 2, range(9, 21), True) == [range(9, 13), range(19, 21)]
     assert colliding_spans(colliding, 30, None, True) == [range(20)]
     colliding[0] = True

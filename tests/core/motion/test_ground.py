@@ -1,4 +1,4 @@
-"""How a motion stands on the ground: measured on a body that is moved as a whole."""
+"""Ground contact of a motion, measured on a rigidly moved body."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def report_of(places: FloatArray) -> GroundReport:
-    """Report on the resting body that is shifted by (T, 3), normalised."""
+    """Report on the resting body shifted by (T, 3), normalised."""
     body, _ = swinging()
     space, size = body.space, body.body_size
     rest = np.array(space.rig.rest)
@@ -35,7 +35,7 @@ def test_what_sinks_floats_and_slides_is_measured() -> None:
     places = np.zeros((12, 3))
     places[:6, 0] = 0.0005 * np.arange(6)
     places[6:, 0] = places[5, 0]
-    # In a frame it jumps down, where nothing stands still.
+    # In one frame it jumps down, when nothing stands still.
     places[9, 2] = -0.02
     found = report_of(places)
     assert (found.sink, found.sink_frame) == (pytest.approx(0.02), 9)
@@ -44,5 +44,5 @@ def test_what_sinks_floats_and_slides_is_measured() -> None:
     assert found.standing_frames == 11
     raised = report_of(np.tile([0.0, 0.0, 0.01], (4, 1)))
     assert (raised.sink, raised.gap) == (0.0, pytest.approx(0.01))
-    # Far above the ground nothing stands on it.
+    # Far above the ground, nothing stands.
     assert report_of(np.tile([0.0, 0.0, 0.2], (4, 1))) == GroundReport()

@@ -1,4 +1,4 @@
-"""Contacts of a motion that is moved onto another body: kept with the flag, lost without it."""
+"""Contacts of a motion moved onto another body: kept with the option, lost without it."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from tests.rigged_shapes import rigged_body, skinned, turned, write_gltf
 
 CLIP, N_FRAMES = "hip", 32
 DOWN, INWARDS = np.radians(42.0), np.radians(97.0)
-"""How far the arm hangs, and how far the elbow is bent, when the hand is at the hip."""
+"""Angles of the arm below horizontal and of the elbow when the hand is on the hip."""
 
 
 def with_hand_on_hip(girth: float) -> Character:
-    """Return a body that puts its left hand to its hip and back; its feet are on the ground."""
+    """Return a body that puts its left hand on its hip and back; its feet are on the ground."""
     body = rigged_body(girth=girth)
     rig = body.rig
     assert rig is not None
@@ -51,7 +51,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def moved_onto(girth: float, source: Path, folder: Path) -> tuple[RigBody, Motion]:
-    """Return a body of another girth, and the motion on it as rotations are copied."""
+    """Return a body of another girth, and the motion on it with copied rotations."""
     body = open_body(write_gltf(rigged_body(girth=girth), folder / "body.glb"))
     assert isinstance(body, RigBody)
     (motion,) = read_motions(body, source)

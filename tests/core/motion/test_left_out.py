@@ -1,4 +1,4 @@
-"""What contact rules leave out of motions: all of a short one, every n-th frame of a long one."""
+"""Pairs left out by contact rules: in all frames of a short motion, every n-th of a long one."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from lcollision_core.motion import screen_frames
 _BLADES = np.array(
     [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -0.5], [0.2, 0.2, 0.1], [0.3, 0.2, 0.1]], float
 )
-"""Two triangles, of which the second stands in the first."""
+"""Two triangles; the second penetrates the first."""
 
 
 @pytest.mark.parametrize(("n_frames", "step"), [(64, 1), (65, 2), (640, 10)])
 def test_a_search_for_what_does_not_count_stays_short_for_long_motions(
     n_frames: int, step: int
 ) -> None:
-    """As that takes several times as long as one for pairs that count."""
+    """It takes several times as long as a search for counting pairs."""
     faces = np.arange(6, dtype=np.int32).reshape(2, 3)
     rules = ContactRules(tolerated_depth=0.5)
     detector = CollisionDetector(Topology(faces, 6), _BLADES, rules)

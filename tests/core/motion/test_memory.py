@@ -1,4 +1,4 @@
-"""What writing a changed motion holds: codes and joints of its frames, not their vertices."""
+"""Memory for writing a changed motion: codes and joints of its frames, not their vertices."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHORT, LONG = 40, 200
 
 
 _ROW = 6
-"""Bodies in a row that move alike, so that their vertices take far more than their joints."""
+"""Number of bodies that move alike, so that vertices need far more memory than joints."""
 
 
 def glb_of(n_frames: int, folder: Path) -> tuple[RigBody, Path]:
@@ -92,7 +92,7 @@ def test_a_longer_motion_takes_no_memory_for_its_vertices(
         finally:
             tracemalloc.stop()
 
-    # What is compiled or read once is held by then.
+    # Compile and read everything that is kept first.
     peak(SHORT)
     (short, n_vertices), (long, _) = peak(SHORT), peak(LONG)
     assert long - short < 0.3 * (LONG - SHORT) * n_vertices * 24

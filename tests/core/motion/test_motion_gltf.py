@@ -1,4 +1,4 @@
-"""Clips of a character's file with some frames changed: what readers then get."""
+"""Clips of a character's file with changed frames, as read back."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SPAN = range(10, 31)
 
 
 def change(body: RigBody, spans: list[range]) -> tuple[ChangedClip, FloatArray]:
-    """Bend the elbow and shift the body in spans of the swing; return that and the codes."""
+    """Bend the elbow and shift the body in spans of the swing; return the clip and the codes."""
     (motion,) = read_motions(body, Path(body.character.source), CLIP)
     codes, space = motion.codes.copy(), body.space
     joint = space.rig.joint_names.index("LeftForeArm")
@@ -52,7 +52,7 @@ def test_readers_get_the_new_frames_and_elsewhere_the_old_motion(
     inside = np.concatenate([np.asarray(span) for span in spans])
     for frame in inside:
         assert np.abs(frames[frame] - body.decode(codes[frame])).max() < 1e-5 * size
-    # Also between the frames, but for the step from the last old frame to the first new one.
+    # Also between frames, except the step from the last old frame to the first new one.
     free = np.ones(N_FRAMES - 1, dtype=np.bool_)
     for span in spans:
         free[max(span.start - 1, 0) : span.stop] = False
@@ -70,7 +70,7 @@ def test_a_clip_that_begins_late_stays_as_long_as_it_was(tmp_path: Path) -> None
     swing = document.description["animations"][0]
     late = document.add_array(np.arange(N_FRAMES)[:, None] / 30.0 + 10.0, has_bounds=True)
     swing["samplers"] = [{**sampler, "input": late} for sampler in swing["samplers"]]
-    # The elbow gets its first keys by the change.
+    # The change gives the elbow its first keys.
     elbow = [node.get("name") for node in document.objects("nodes")].index("LeftForeArm")
     swing["channels"] = [one for one in swing["channels"] if one["target"]["node"] != elbow]
     source.write_bytes(document.encoded())
@@ -116,7 +116,7 @@ def test_a_clip_is_written_as_often_as_one_likes(
 ) -> None:
     source = write_gltf(swinging_body(), tmp_path / "body.glb")
     counted = sum(one["count"] for one in described(source)[0]["accessors"])
-    # All of the file once: no number of it is wider than a matrix.
+    # A bound for the whole file: no element is wider than a matrix.
     monkeypatch.setattr(schema, "MAX_NUMBERS", 16 * counted)
     body = RigBody.of(read_character(source))
     changed, _ = change(body, [SPAN])

@@ -1,4 +1,4 @@
-"""What comes out of a resolution is nowhere worse than what went in."""
+"""Resolving never makes a motion worse."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ UP = (0.0, 0.0, 1.0)
 
 
 def overlaps(body: RigBody, vertices: np.ndarray) -> tuple[int, float]:
-    """Count the pairs that count, and measure the deepest, by brute force."""
+    """Return the number of counting pairs and the largest depth, by brute force."""
     size = body.body_size
     found = all_pairs(vertices.astype(np.float64), body.faces, DEPTH_TOLERANCE * size)
     depth = found.depth[body.detector.rules_of(found.pairs, found.depth / size) == 0] / size
@@ -48,7 +48,7 @@ def overlaps(body: RigBody, vertices: np.ndarray) -> tuple[int, float]:
 def require_no_worse(
     body: RigBody, before: Motion, found: ResolvedMotion, largest_change: float
 ) -> None:
-    """Compare a motion with itself as it was, frame by frame."""
+    """Compare a motion with the original, frame by frame."""
     after, check = found.motion, body.exact_check()
     named = np.zeros(len(before), dtype=np.bool_)
     for kept in found.kept:
@@ -126,7 +126,7 @@ def test_no_rig_morph_or_clip_comes_out_worse(
     largest_change: float,
     seed: int,
 ) -> None:
-    """Arms swing into a trunk, a morph target of which grows into them."""
+    """Arms swing into a trunk, and a morph target of the trunk grows into them."""
     rig, topology, rest = figure(n_arms, radius)
     body = RigBody.of(character_of("figure", topology, rest, rig, list(UP), 0))
     random, n = np.random.default_rng(seed), 12
@@ -160,7 +160,7 @@ def test_no_rig_morph_or_clip_comes_out_worse(
 
 
 def in_the_trunk(frames: range) -> tuple[RigBody, Motion]:
-    """Return the swing, in some frames of which a morph makes the head a ball round the neck."""
+    """Return the swing; in `frames`, a morph turns the head into a ball around the neck."""
     body, motion = swinging()
     is_head = body.space.vertex_domain == body.domain_names.index("Head")
     space = body.space
@@ -181,7 +181,7 @@ def test_what_no_joint_can_free_stays_and_its_neighbours_are_freed() -> None:
     check = body.exact_check()
     before = screen_motion(motion, check)
     swing = [one.frame for one in before.colliding if one.frame > 4]
-    # Their easing meets.
+    # Their easing overlaps.
     options = MotionOptions(easing=12)
     found = resolve_motion(body.resolver, motion, UP, options)
     (kept,) = found.kept
@@ -198,7 +198,7 @@ def test_what_no_joint_can_free_stays_and_its_neighbours_are_freed() -> None:
 
 def test_within_a_small_change_a_span_gets_less_overlap() -> None:
     body, swing = swinging()
-    # Nearly still, and no cycle.
+    # Nearly still, and not a cycle.
     codes = np.tile(swing.codes[16], (4, 1)) + 1e-9 * np.arange(4)[:, None]
     motion = Motion("still", swing.times[:4], codes)
     options = MotionOptions(easing=2, frame=ResolveOptions(largest_change=0.02))
@@ -218,7 +218,7 @@ def test_what_a_file_cannot_hold_is_put_back_in_it(tmp_path: Path) -> None:
     assert isinstance(body, RigBody)
     (motion,) = read_motions(body, source, CLIP)
     codes = np.array(motion.codes)
-    # Deeper than it was, and, in another span, hardly changed.
+    # Make one span deeper than before, and leave another almost unchanged.
     codes[20:28] += 0.2 * (motion.codes[20:28] - motion.codes[0])
     codes[2] += 1e-3
     worse = Motion(CLIP, motion.times, codes)
@@ -233,12 +233,12 @@ def test_what_a_file_cannot_hold_is_put_back_in_it(tmp_path: Path) -> None:
 
 
 def test_what_is_written_is_judged_as_what_is_read(tmp_path: Path) -> None:
-    """Two legs come nearer by a billionth a frame, until they touch and beyond."""
+    """Two legs approach by a billionth per frame until they touch, and further."""
     character = swinging_body(n_frames=41)
     rig = character.rig
     assert rig is not None
     way = np.zeros((41, 3))
-    # Limbs have a corner on the side where the other one comes.
+    # Each limb has a corner on the side facing the other.
     way[:, 0] = 0.1 - np.arange(-20, 21) * 1e-9
     source = write_gltf(character, tmp_path / "touch.glb", shifts={"RightUpLeg": way})
     body = open_body(source)

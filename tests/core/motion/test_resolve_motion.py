@@ -1,4 +1,4 @@
-"""Motions resolved: free, near, as smooth as they were, and what is kept of them."""
+"""Resolved motions: free, near, equally smooth, and the frames that are kept."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def test_all_frames_become_free_and_so_do_the_poses_between(resolved: ResolvedMo
     assert resolved.after.all()
     screened = screen_motion(resolved.motion, check)
     assert (screened.colliding, screened.in_between) == ((), ())
-    # By code that shares nothing with the search; the tubes do not touch at rest, and what is near
-    # along one of them is not counted.
+    # By independent code; the tubes do not touch at rest, and pairs that are near along a tube are
+    # not counted.
     faces = body.topology.faces.astype(np.int64)
     tube = component_labels(body.topology)[faces[:, 0]]
 
@@ -81,7 +81,7 @@ def test_the_motion_stays_near_and_as_smooth_as_it_was(resolved: ResolvedMotion)
     report = MotionReport.of(motion, resolved.motion, check, resolved.standing)
     assert report.acceleration_ratio < 1.04
     assert 0.0 < report.mean_change < 0.01
-    # Frame by frame, each from the correction of the one before, it shakes.
+    # Resolved frame by frame, each from the previous correction, it jitters.
     results = body.resolver.resolve_many(motion.codes, workers=1, sequence=True)
     codes = np.stack([result.latent for result in results])
     shaking = MotionReport.of(motion, Motion("shaking", motion.times, codes), check)
@@ -103,7 +103,7 @@ def test_an_arm_that_passes_through_the_trunk_between_two_free_frames_goes_round
     assert found.motion.codes[outside].tobytes() == motion.codes[outside].tobytes()
     # Without poses between frames, nothing is wrong with it.
     assert resolve_motion(body.resolver, motion, UP, replace(OPTIONS, substeps=0)).spans == ()
-    # Nor where only the frames on one side may change.
+    # Nor if only the frames on one side may change.
     assert resolve_motion(body.resolver, motion, UP, OPTIONS, within=range(14)).spans == ()
 
 
@@ -223,7 +223,7 @@ def test_a_run_that_is_to_end_keeps_the_windows_that_are_done(
     body = RigBody.of(character)
     frames = character.sample(CLIP, None)
     assert frames.transforms is not None
-    # Without its end it is no cycle.
+    # Without its end it is not a cycle.
     codes = body.space.codes_of_transforms(frames.transforms[:76])
     motion = Motion(CLIP, frames.times[:76], codes)
     monkeypatch.setattr(sys.modules[resolve_motion.__module__], "WINDOW", 44)
@@ -242,7 +242,7 @@ def test_a_run_that_is_to_end_keeps_the_windows_that_are_done(
     assert 5 < len(inside) < len(colliding)
     check, codes = body.exact_check(), found.motion.codes
     assert check.are_free(codes[done.start : done.stop]).all()
-    # The correction fades behind the last frame that collided.
+    # The correction fades out after the last colliding frame.
     moved = np.linalg.norm(codes - motion.codes, axis=1)
     fading = moved[inside[-1] : done.stop + 1]
     assert fading[-1] == 0.0
@@ -257,13 +257,13 @@ def test_a_frame_that_cannot_be_freed_ends_nothing() -> None:
     codes = np.zeros((3, body.latent_size))
     codes[1:, -1] = 0.1, 0.05
     motion = Motion("stuck", np.arange(3) / 30.0, codes)
-    # Turning as a whole, and one foot, does not take the head out of the trunk.
+    # Moving the whole body and one foot cannot remove the head from the trunk.
     locked = frozenset(range(len(body.domain_names))) - {body.domain_names.index("Left foot")}
     options = MotionOptions(keep_feet=False, frame=ResolveOptions(locked_domains=locked))
     found = resolve_motion(body.resolver, motion, UP, options)
     assert not found.before.any()
     assert not found.after.any()
-    # What cannot be freed is not moved either.
+    # A span that cannot be freed is not changed.
     assert found.motion.codes.tobytes() == codes.tobytes()
 
 

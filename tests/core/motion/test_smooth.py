@@ -1,4 +1,4 @@
-"""The program of a span against the dense one that it stands for."""
+"""The structured program of a span against the equivalent dense one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ N, SIZE, WEIGHT = 7, 3, 20.0
 
 
 def cost(rows: FloatArray, metric: FloatArray, lead: FloatArray, tail: FloatArray) -> float:
-    """Return the cost of (N, SIZE) corrections between two given ones on either side."""
+    """Return the cost of (N, SIZE) corrections, given two fixed ones on each side."""
     bends = np.diff(np.concatenate([lead, rows, tail]), n=2, axis=0)
     squared = [np.einsum("td,de,te->", part, metric, part) for part in (rows, bends)]
     return float(squared[0] + WEIGHT * squared[1])
@@ -61,7 +61,7 @@ def test_the_corrections_of_a_cycle_are_as_smooth_across_its_seam() -> None:
             moved = kernel.mean.copy()
             moved[frame] += step
             assert of_cycle(moved) > of_cycle(kernel.mean)
-    # It is the same seen from the pinned frame, either way.
+    # It is symmetric around the pinned frame.
     around = np.roll(kernel.mean[:, 0], -1)
     np.testing.assert_allclose(around[1:], around[:0:-1])
 
@@ -71,7 +71,7 @@ def test_constraints_hold_at_the_least_cost(metric: FloatArray) -> None:
     still = np.zeros((2, SIZE))
     kernel = TimeKernel.of(N, WEIGHT, still, still, {}, SIZE)
     shares = np.eye(N)[[1, 3, 5]]
-    # Half-way between two frames.
+    # Halfway between two frames.
     shares[1] = 0.5 * (np.eye(N)[3] + np.eye(N)[4])
     normals, offsets = generator.normal(size=(3, SIZE)), np.array([-0.5, -0.2, 0.3])
     found = least_corrections(kernel, np.linalg.inv(metric), HalfSpaces(shares, normals, offsets))
@@ -95,7 +95,7 @@ def test_constraints_hold_at_the_least_cost(metric: FloatArray) -> None:
 
 
 def test_many_contacts_that_contradict_each_other_hold_as_far_as_they_yield() -> None:
-    """Of a gram with the softness on its diagonal, multipliers and what is left are both >= 0."""
+    """With the softness on the Gram matrix's diagonal, multipliers and residuals are >= 0."""
     generator = np.random.default_rng(7)
     for n_contacts, n_codes in ((40, 60), (200, 20), (300, 3)):
         normals = generator.normal(size=(n_contacts, n_codes))
@@ -123,7 +123,7 @@ def test_locked_codes_do_not_move(metric: FloatArray) -> None:
     assert found is not None
     assert not found[:, 0].any()
     assert found[2].sum() == pytest.approx(-1.0, abs=1e-3)
-    # What only locked codes would satisfy changes nothing.
+    # A constraint that only locked codes could satisfy changes nothing.
     out_of_reach = HalfSpaces(np.eye(N)[[3]], np.eye(1, SIZE), np.array([-1.0]))
     both = rows.joined(out_of_reach)
     np.testing.assert_array_equal(least_corrections(kernel, inverse, both), found)

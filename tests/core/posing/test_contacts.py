@@ -1,4 +1,4 @@
-"""The way out of contact: slopes of depths by corners and by codes, against differences."""
+"""Slopes of penetration depths by corners and by codes, against finite differences."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ def test_slopes_by_corners_are_those_of_differences() -> None:
             differences[:, corner, axis] = (ends[0] - ends[1]) / (2.0 * STEP)
     np.testing.assert_allclose(slopes, differences, atol=1e-6)
     assert np.abs(slopes).max() > 0.5
-    # Nothing is gained by moving or turning both.
+    # Moving or rotating both together changes nothing.
     np.testing.assert_allclose(slopes.sum(axis=1), 0.0, atol=1e-12)
 
 
 def test_both_kinds_of_direction_are_met() -> None:
-    """A corner through a face and an edge through an edge, whose depths are known."""
+    """A corner through a face and an edge through an edge, with known depths."""
     face = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
     corner = [[1, 1, -0.1], [1, 1, 3], [1.5, 1, 3]]
     depth, slopes = depth_slopes([face], [corner])
@@ -75,7 +75,7 @@ def check_of(model: LearnedBody) -> ExactCheck:
 def test_slopes_by_codes_are_those_of_differences(
     tube_model: LearnedBody, colliding: FloatArray
 ) -> None:
-    # The decoder's features are float32, so the step must be far above their rounding.
+    # The decoder's features are float32, so the step must be far above their rounding error.
     step = 1e-2
     generator = np.random.default_rng(1)
     by_vertices = generator.normal(size=(3, tube_model.n_vertices, 3))
@@ -107,7 +107,7 @@ def test_contacts_get_shallower_against_their_slopes(
         assert (np.diff(depth) <= 0.0).all()
         assert len(depth) == len(slopes) >= 1
         step = 1e-3 * found.penetration_depth.max() * slopes[0] / (slopes[0] @ slopes[0])
-        # The same pairs, a little further out: their weighted depth falls by what the slope says.
+        # The same pairs, moved out a little: their weighted depth falls as the slope predicts.
         a, b = tube_model.faces[found.pairs].transpose(1, 0, 2)
         weights = found.penetration_depth**2
 
@@ -123,7 +123,7 @@ def test_contacts_get_shallower_against_their_slopes(
 
 
 def test_the_displacement_metric_measures_vertices(tube_model: LearnedBody) -> None:
-    """Its distance predicts the mean squared vertex motion; the plain one knows nothing of it."""
+    """Its distance predicts the mean squared vertex motion; the Euclidean one does not."""
     embedding = tube_model.embedding
     metric = tube_model.space.metric
     generator = np.random.default_rng(2)

@@ -1,4 +1,4 @@
-"""Drags: where they lead, what stays, and that a solid one never collides."""
+"""Drags: targets, fixed parts, and solid drags that never collide."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_pins_stay_while_the_tip_moves(
 def test_a_solid_drag_is_free_where_a_plain_one_collides(
     tube_model: LearnedBody, free: FloatArray, tip: Grip, foot: Grip
 ) -> None:
-    """The tip goes to the foot, and further."""
+    """The tip is dragged to the foot, and further."""
     start, end = (grip.position(tube_model.decode(free)) for grip in (tip, foot))
     collided = []
     dragger = tube_model.dragger()
@@ -122,7 +122,7 @@ def test_a_solid_drag_is_free_where_a_plain_one_collides(
 def test_many_random_solid_events_never_collide(
     tube_model: LearnedBody, free: FloatArray, tip: Grip, foot: Grip
 ) -> None:
-    """Grips, twists, codes, pins and locks in random order, each drag from where the last ended."""
+    """Grips, twists, codes, pins and locks in random order, each from the last drag's end."""
     generator = np.random.default_rng(0)
     dragger, latent = tube_model.dragger(), free
     held, n_touching = 0, 0
@@ -138,7 +138,7 @@ def test_many_random_solid_events_never_collide(
         step = dragger.begin(latent, grip, pins, options)
         codes = tube_model.embedding.codes_of(locked)
         for event in range(40):
-            # The pointer rests for a while at each place.
+            # The pointer rests for a while at each position.
             if event % 10:
                 pass
             elif grip is None:
@@ -172,7 +172,7 @@ def test_a_colliding_pose_is_not_made_worse(tube_model: LearnedBody, tip: Grip) 
             step = dragger.move(start + generator.normal(size=3) * 0.3 * tube_model.body_size)
             assert step.found is not None
             assert before is not None
-            # To rounding, or to what a region's own depths allow.
+            # Up to rounding, or up to the tolerated depths of a region.
             assert step.found.energy <= before.energy * (1.0 + 1e-5) or step.exactly_free
             before = step.found
         freed += bool(step.exactly_free)
@@ -182,7 +182,7 @@ def test_a_colliding_pose_is_not_made_worse(tube_model: LearnedBody, tip: Grip) 
 def test_codes_that_the_target_leaves_do_not_move(
     tube_model: LearnedBody, free: FloatArray
 ) -> None:
-    """As for one slider: it stops at contact, and the others stay."""
+    """Like a single slider: it stops at contact, and the others stay."""
     dragger, low, high = tube_model.dragger(), tube_model.space.low, tube_model.space.high
     stopped = 0
     for code in range(tube_model.latent_size):
@@ -210,7 +210,7 @@ def test_a_twist_turns_a_limb_about_its_long_axis() -> None:
     inside = body.space.vertex_domain == thigh
     now = step.vertices[inside].astype(np.float64)
     before = before[inside] - before[inside].mean(axis=0)
-    # A rigid fit turns about the limb, by about what was asked for.
+    # A rigid fit turns about the limb, by about the requested angle.
     turn, _ = Rotation.align_vectors(now - now.mean(axis=0), before)
     axis = np.linalg.eigh(before.T @ before)[1][:, -1]
     assert abs(float(turn.as_rotvec() @ axis)) == pytest.approx(0.5, abs=0.15)
@@ -255,7 +255,7 @@ def test_slopes_of_goals_are_those_of_differences(
 def test_limbs_do_not_stretch_beyond_the_limit(
     tube_model: LearnedBody, free: FloatArray, tip: Grip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The tube's codes stretch it by 6 % at most.
+    # The tube's codes stretch it by at most 6 %.
     monkeypatch.setattr("lcollision_core.posing.dragger.STRETCH", 0.03)
     lengths = tube_model.topology.edge_lengths
     longest = np.max([lengths(v) for v in tube_model.decode(tube_model.known_poses)], axis=0)
@@ -318,6 +318,6 @@ def test_bad_poses_are_refused(tube_model: LearnedBody, free: FloatArray, tip: G
         dragger.begin(free, tip, [Pin(10**6, 0.03, (0.0, 0.0, 0.0))])
     with pytest.raises(LCollisionError, match="the body part to twist must be 1 to 2, got 100"):
         dragger.begin(free, Twist(99))
-    # A drag that did not begin does not go on with the one before.
+    # A drag that failed to begin does not continue the previous one.
     with pytest.raises(RuntimeError, match="no drag has begun"):
         dragger.move(np.zeros(3))

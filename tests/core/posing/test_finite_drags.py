@@ -1,4 +1,4 @@
-"""Drags of any rig lead to numbers: joints in one place, joints that lead nothing, flat parts."""
+"""Drags stay finite for any rig: coincident joints, joints without vertices, flat parts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ N_EVENTS = 3
 
 
 def random_tube(seed: int) -> Character:
-    """Rig the tube with a random tree, in which joints may share a place and lead no vertex."""
+    """Rig the tube with a random tree; joints may coincide and have no vertices."""
     random, tube = np.random.default_rng(seed), rigged_tube()
     points = tube.rest_vertices
     n_joints = int(random.integers(2, 7))

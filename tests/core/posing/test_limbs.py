@@ -1,4 +1,4 @@
-"""What a drag moves of a body of limbs, what follows, and what stays."""
+"""Drags of bodies with limbs: the parts that move, follow and stay."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def dragged(
     start: FloatArray | None = None,
     n_events: int = 30,
 ) -> DragStep:
-    """Drag a patch by a normalised way, slowly, and let it settle."""
+    """Drag a patch slowly by a normalised vector, and let it settle."""
     dragger = model.dragger()
     step = dragger.begin(
         np.zeros(model.latent_size) if start is None else start, grip, pins, options
@@ -49,7 +49,7 @@ def dragged(
 
 
 def grip_on(model: RigBody, joint: str, radius: float = 0.03) -> Grip:
-    """Take the patch whose middle is led by a joint and is nearest to it."""
+    """Return the patch around the vertex of a joint that is nearest to it."""
     space = model.space
     names = [name.split(":")[-1] for name in space.rig.joint_names]
     heaviest = space.rig.joint_of[np.arange(model.n_vertices), space.rig.weights.argmax(axis=1)]
@@ -59,7 +59,7 @@ def grip_on(model: RigBody, joint: str, radius: float = 0.03) -> Grip:
 
 
 def moved_joints(model: RigBody, latent: FloatArray) -> set[str]:
-    """Return the joints that have turned against their parents by more than a tenth of a degree."""
+    """Return the joints turned relative to their parents by more than a tenth of a degree."""
     turned = model.space.joint_of_code[6:][np.abs(latent[6:]) > np.radians(0.1)]
     return {model.space.rig.joint_names[joint].split(":")[-1] for joint in turned}
 
@@ -108,13 +108,13 @@ def test_a_hand_moves_its_arm_then_the_trunk_and_no_other_limb(body: RigBody) ->
 
 
 def test_who_holds_what_carries_the_legs_holds_the_root() -> None:
-    """Rigs whose trunk and pelvis hang on a root of their own."""
+    """In rigs whose trunk and pelvis are children of a separate root."""
     character = rigged_body()
     rig = character.rig
     assert rig is not None
     names = list(rig.joint_names)
     root, spine = names.index("Hips"), names.index("Spine")
-    # A root at the hips, on which the pelvis and the spine hang.
+    # A root at the hips, the parent of the pelvis and the spine.
     parents = np.concatenate([[-1], rig.parents + 1])
     parents[1 + root], parents[1 + spine] = 0, 0
     below = replace(
@@ -153,7 +153,7 @@ def test_an_arm_with_a_pinned_hand_bends_and_the_trunk_stays(body: RigBody, n_ev
     hand = make_grip(space, far_end(space, body.domain_names.index("Left hand")))
     bent = dragged(body, hand, np.array([-0.15, -0.2, -0.05])).latent
     pin = Pin.of(hand, body.decode(bent))
-    # The elbow swings about the line from the shoulder to the hand.
+    # The elbow swings about the line from shoulder to hand.
     way, grip = np.array([0.0, -0.03, -0.05]), grip_on(body, "LeftForeArm")
     step = dragged(body, grip, way, (pin,), start=bent, n_events=n_events)
     assert step.miss < 0.1 * np.linalg.norm(way)
@@ -163,7 +163,7 @@ def test_an_arm_with_a_pinned_hand_bends_and_the_trunk_stays(body: RigBody, n_ev
 
 
 def test_an_arm_in_a_tight_sleeve_shows_what_keeps_it(body: RigBody) -> None:
-    """A sleeve of the trunk's: contacts on all sides, none of which the pose has reached."""
+    """A sleeve of the trunk: contacts on all sides, none of which the pose has reached."""
     character, rig = body.character, body.space.rig
     (arm,) = (group for group in character.groups if group.name == "LeftArm")
     own = np.unique(body.faces[arm.faces])
@@ -287,7 +287,7 @@ def test_an_arm_that_is_drawn_in_by_its_fingers_bends_at_the_elbow(characters: P
 
 
 def test_a_drag_has_not_settled_where_a_step_overshot(characters: Path) -> None:
-    """The trunk joins in as the arm is stretched out, and its first steps are too long."""
+    """The trunk starts to follow when the arm is stretched, and its first steps overshoot."""
     model = open_body(str(characters / "mannequin-moves.glb"))
     space = model.space
     grip = make_grip(space, 12665, 0.03)

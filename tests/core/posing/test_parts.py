@@ -1,4 +1,4 @@
-"""Body parts as shapes: long axes and far ends."""
+"""Shapes of body parts: long axes and far ends."""
 
 from __future__ import annotations
 

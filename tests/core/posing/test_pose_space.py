@@ -1,4 +1,4 @@
-"""The latent pose space: slopes of patches' means that are solved for once, and what it keeps."""
+"""The latent pose space: slopes of patches' means, solved once, and cached features."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_mean_slopes_are_those_of_vertices(tube_model: LearnedBody) -> None:
 
 
 def test_mean_slopes_are_those_of_differences(tube_model: LearnedBody) -> None:
-    # The decoder's features are float32, so the step must be far above their rounding.
+    # The decoder's features are float32, so the step must be far above their rounding error.
     step = 1e-2
     space, weights = tube_model.space, patches(tube_model)
     codes = sample_poses(tube_model, 1, seed=4)[0]
@@ -51,7 +51,7 @@ def test_mean_slopes_are_those_of_differences(tube_model: LearnedBody) -> None:
 
 
 def test_a_pose_does_not_depend_on_the_one_before(tube_model: LearnedBody) -> None:
-    """The features of the last codes are kept, and codes may be changed in their place."""
+    """The features of the last codes are cached, and codes may be changed in place."""
     space, poses = tube_model.space, sample_poses(tube_model, 2, seed=4)
     slopes = space.mean_slopes(csr_matrix(patches(tube_model)))
     none = np.empty((0, tube_model.n_vertices, 3))
@@ -80,7 +80,7 @@ def test_a_space_remembers_its_last_poses_and_nothing_keeps_it(tube_model: Learn
         np.testing.assert_array_equal(
             space.decode(one[None]), tube_model.embedding.decode(one[None])
         )
-    # Others have taken its place.
+    # It has been replaced in the cache.
     assert not np.shares_memory(first, space.decode(codes[:1]))
     gone = weakref.ref(space)
     gc.disable()

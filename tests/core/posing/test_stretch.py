@@ -1,4 +1,4 @@
-"""The stretch of edges, against NumPy and differences."""
+"""The stretch of edges, against NumPy and finite differences."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def mesh() -> Mesh:
 
 @pytest.fixture
 def longest(mesh: Mesh) -> FloatArray:
-    """Return lengths that some edges of the sphere exceed, and most do not."""
+    """Return lengths that some edges of the sphere exceed, but most do not."""
     lengths = mesh.topology.edge_lengths(mesh.vertices)
     return lengths * np.random.default_rng(0).uniform(0.9, 1.3, len(lengths))
 

@@ -1,4 +1,4 @@
-"""Where a predictor is sure, and how often it then errs."""
+"""The ranges in which a predictor is sure, and its errors there."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lcollision_core.predictor.metrics import ERROR_BOUNDS, SureRange, sure_rang
 
 
 def _drawn(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return logits, and outcomes of these probabilities."""
+    """Return logits, and outcomes drawn with their probabilities."""
     generator = np.random.default_rng(seed)
     logit = 6.0 * generator.normal(size=n)
     return logit, generator.random(n) < expit(logit)
@@ -70,7 +70,7 @@ def test_no_limit_nearer_to_the_threshold_has_as_few_errors() -> None:
 
 def test_few_samples_confirm_no_small_bound() -> None:
     logit, colliding = np.linspace(-9.0, 9.0, 1000), np.arange(1000) >= 500
-    # Without an error among 1000, 0.3 % is the least that is 95 % certain.
+    # Without an error in 1000, 0.3 % is the least bound with 95 % confidence.
     assert [one.error_bound for one in sure_ranges(logit, colliding)] == [3e-3, 1e-2, 3e-2]
     assert sure_ranges(logit, colliding)[0].coverage == 1.0
 
@@ -88,14 +88,14 @@ def test_what_is_not_sure_is_checked_exactly(body: LearnedBody) -> None:
     exact = judge_poses(sure, latent)
     assert exact.exact.all()
     assert np.array_equal(exact.colliding, truth)
-    assert judge_poses(sure, latent, 5e-3).exact.all()  # smaller than any that is known
+    assert judge_poses(sure, latent, 5e-3).exact.all()  # smaller than any known bound
     hybrid = judge_poses(sure, latent, 2e-2)
     assert np.array_equal(hybrid.exact, (logit >= low) & (logit <= high))
     assert np.array_equal(hybrid.colliding[hybrid.exact], truth[hybrid.exact])
     assert np.array_equal(hybrid.colliding[~hybrid.exact], logit[~hybrid.exact] > high)
-    # What is free may still come nearer than a clearance.
+    # A free pose may still violate a clearance.
     roomy = judge_poses(sure, latent, 2e-2, sure.detector.with_clearance(1e-3))
     assert np.array_equal(roomy.exact, logit <= high)
-    # The predictor knows nothing of a depth that is tolerated.
+    # The predictor does not know of tolerated depths.
     tolerant = sure.with_options(RuleOptions(tolerated_depth=1e-3))
     assert judge_poses(tolerant, latent, 2e-2).exact.all()

@@ -1,4 +1,4 @@
-"""The default network: its points, what they see, and the patches that it is taught."""
+"""The default network: its points, their contact features, and its training patches."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_points_are_spread_and_every_vertex_belongs_to_the_nearest(tube_model: L
 
 def test_loose_pieces_of_skin_belong_to_the_nearest_of_all_centres() -> None:
     triangle = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    # The second lies beside corner 1 of the first, and a vertex in no face beside its corner 2.
+    # The second lies beside corner 1 of the first, and an unused vertex beside its corner 2.
     vertices = np.concatenate([triangle, triangle + [1.2, 0.0, 0.0], [[0.0, 1.1, 0.0]]])
     topology = Topology(np.array([[0, 1, 2], [3, 4, 5]]), 7)
     embedding = cast(Embedding, SimpleNamespace(topology=topology, rest_vertices=vertices))
@@ -126,7 +126,7 @@ def test_frames_and_gradients_are_those_of_the_embedding(
 def _field(
     near: np.ndarray, order: np.ndarray, frame: np.ndarray, positions: np.ndarray
 ) -> np.ndarray:
-    """Return the compiled field of points, of which some are neighbours along the surface."""
+    """Return the compiled field of points, some of them neighbours along the surface."""
     field = np.empty((positions.shape[2], len(frame), *UNITS.shape))
     contact_field(frame, positions, order, _blocks(near, order), field)
     return field
@@ -138,7 +138,7 @@ def _blocks(near: np.ndarray, order: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_the_compiled_field_is_that_of_torch() -> None:
-    """On a GPU torch does what the compiled loops do on the CPU, where far blocks are left out."""
+    """On a GPU, torch computes the same as the compiled CPU loops, which skip far blocks."""
     rng = np.random.default_rng(4)
     positions = 0.05 * rng.standard_normal((2, 3, 45))
     positions[1, 0, 20:] += 0.6
@@ -166,7 +166,7 @@ def test_the_compiled_field_is_that_of_torch() -> None:
 
 
 def test_field_by_hand() -> None:
-    """Two points face each other across 0.05; a third behind the first one's skin is not seen."""
+    """Two points face each other across 0.05; a third, behind the first one's skin, is ignored."""
     frame = np.tile(np.eye(3), (1, 3, 1, 1))
     frame[0, 1] = np.diag([-1.0, 1.0, -1.0])
     positions = np.zeros((1, 3, 3))
@@ -177,10 +177,10 @@ def test_field_by_hand() -> None:
     for k, radius in enumerate(RADII):
         weight = (1.0 - (0.05**2 + 0.01**2) / radius**2) ** 3
         share, mean = weight / (weight + FULL), weight / (weight + SOME)
-        # The first is 0.05 above the second's plane, whose normal points back at it.
+        # The first is 0.05 above the second's plane, whose normal points to it.
         means = np.array([0.05 / radius, 0.05 / radius, 0.01 / radius, 0.0, -1.0, 0.0, 0.0])
         assert first[k] == pytest.approx(np.array([share, *(mean * means)]), abs=1e-12)
-        # The second's own frame turns what it sees: ahead is -x of the world.
+        # The second's local frame rotates its features: its forward is the world's -x.
         means[2] *= -1.0
         assert second[k] == pytest.approx(np.array([share, *(mean * means)]), abs=1e-12)
 
@@ -199,7 +199,7 @@ def test_only_points_far_along_the_surface_count() -> None:
 
 
 def test_neighbours_are_in_one_block() -> None:
-    """Two clusters of 8 and one of 3 points, in any order, come out as three blocks."""
+    """Two clusters of 8 points and one of 3, in any order, give three blocks."""
     rng = np.random.default_rng(3)
     cluster = rng.permutation(np.repeat([0, 1, 2], [8, 8, 3]))
     positions = 10.0 * cluster[:, None] + rng.random((19, 3))
@@ -214,7 +214,7 @@ def test_neighbours_are_in_one_block() -> None:
 def test_folds_are_looked_for_where_the_skin_folds(
     tube_model: LearnedBody, tube_folds: np.ndarray
 ) -> None:
-    """Sites lie where near pairs collide, and their members about them."""
+    """Sites lie at colliding near pairs, and their members around them."""
     embedding = tube_model.embedding
     assert tube_folds.shape[1] == N_MEMBERS
     assert 1 <= len(tube_folds) <= N_SITES
@@ -246,7 +246,7 @@ def test_a_body_without_folds_has_no_sites(tube_model: LearnedBody) -> None:
 
 
 def test_inputs_are_the_same_with_derivatives_and_without(tube_model: LearnedBody) -> None:
-    """Without derivatives the CPU takes the compiled loops, in blocks of rows; with them torch."""
+    """Without derivatives, the CPU uses compiled loops in blocks of rows; with them, torch."""
     rows = labeller_of(tube_model).label(colliding_latent(tube_model, 70))
     network = GeometricNetwork.build(tube_model.embedding, PRESETS["default"], rows)
     assert isinstance(network, GeometricNetwork)
@@ -301,7 +301,7 @@ def test_patches_and_folds_share_out_the_exact_energy(
 def test_every_collision_that_counts_is_taught(
     tube_model: LearnedBody, rules: ContactRules
 ) -> None:
-    """With sites and without, and by rules, what these exclude being neither contact nor fold."""
+    """With and without sites, and with rules; excluded pairs are neither contact nor fold."""
     embedding, latent = tube_model.embedding, colliding_latent(tube_model)
     detector = CollisionDetector(embedding.topology, embedding.rest_vertices, rules=rules)
     found = detector.detect_batch(embedding.decode(latent).astype(np.float32))
@@ -370,7 +370,7 @@ def test_the_loss_teaches_patches_folds_energies_and_the_verdict(
     network = GeometricNetwork(tube_model.embedding, 0, tube_folds)
     n_points, n_folds, n_domains = len(network.skin.point_vertices), len(tube_folds), 2
     assert n_folds > 0
-    # Two rows. The first one's patches and folds collide, with roots of 0.4 and 3.
+    # Two rows. The first one's patches and folds collide, with square roots of 0.4 and 3.
     taught = torch.zeros((2, n_points + n_folds), dtype=torch.float64)
     taught[0, :n_points], taught[0, n_points:] = 0.4, 3.0
     energy = torch.tensor([[0.25, 0.0], [0.0, 0.0]], dtype=torch.float64)
@@ -390,7 +390,7 @@ def test_the_loss_teaches_patches_folds_energies_and_the_verdict(
     patches = 20.0 * np.log(2.0) + 5.0 * 0.5 * 0.4**2 / 2
     folds = 5.0 * np.log(2.0) + 1.25 * (3.0 - 0.5) / 2
     verdict = -(np.log(0.75) + np.log(0.25)) / 2
-    # Of six roots two are 0.5.
+    # Two of six square roots are 0.5.
     energies = 2 * 0.5 * 0.5**2 / 6
     expected = patches + folds + verdict + energies
     assert float(loss(values)) == pytest.approx(expected)
@@ -409,7 +409,7 @@ def test_the_loss_teaches_patches_folds_energies_and_the_verdict(
 def test_a_process_without_rows_adds_nothing(
     tube_model: LearnedBody, tube_folds: np.ndarray
 ) -> None:
-    """As where the last batch is smaller than the number of processes."""
+    """For example if the last batch is smaller than the number of processes."""
     network = GeometricNetwork(tube_model.embedding, 0, tube_folds)
     latent = torch.zeros((2, tube_model.latent_size))
     n_cells = len(network.skin.point_vertices) + len(tube_folds)

@@ -1,4 +1,4 @@
-"""The default network without torch: the same numbers, and the same derivatives."""
+"""The default network without torch: equal values and derivatives."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lcollision_core.predictor.stored_network import require_network
 def network(
     tube_model: LearnedBody, tube_folds: np.ndarray, request: pytest.FixtureRequest
 ) -> GeometricNetwork:
-    """Return a network with weights that are not zero anywhere."""
+    """Return a network without zero weights."""
     sites = tube_folds if request.param == "folds" else tube_folds[:0]
     made = GeometricNetwork(tube_model.embedding, 7, sites)
     latent = tube_model.latent_space.sample(40, np.random.default_rng(1)).astype(np.float32)
@@ -50,7 +50,7 @@ def test_it_agrees_with_the_torch_network(
     output = exact(codes)
     (gradient,) = torch.autograd.grad(output.logit.sum(), codes)
     energy, logit = compiled.outputs(latent)
-    # Single against double precision.
+    # Single versus double precision.
     np.testing.assert_allclose(energy, output.domain_energy.detach(), rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(logit, output.logit.detach(), rtol=1e-4, atol=1e-4)
     again, slope = compiled.logit_and_gradient(latent)
@@ -91,7 +91,7 @@ def test_arrays_of_another_network_are_refused(
 
 
 def test_predicting_and_resolving_a_pose_need_no_torch() -> None:
-    """It would double the memory and the time until the editor's predictions are there."""
+    """It would double the memory, and the time until the editor's predictions are ready."""
     code = (
         "import sys, numpy as np\n"
         "from lcollision_core.bodies import LearnedBody, find_model\n"

@@ -1,4 +1,4 @@
-"""The paper's losses and scores against numbers worked by hand."""
+"""The paper's losses and scores against values by hand."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _double(*values: object) -> torch.Tensor:
 
 
 def _require_gradient(loss: object, values: torch.Tensor) -> None:
-    """Compare autograd with central differences, and ask for a gradient that is not 0."""
+    """Compare autograd with central differences, and require a non-zero gradient."""
     values = values.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(loss(values).sum(), values)  # type: ignore[operator]
     assert gradient.abs().max() > 0.0
@@ -71,7 +71,7 @@ def test_depth_loss_vanishes_for_the_truth_when_the_masks_conserve_energy() -> N
 def test_rank_loss_wants_the_larger_to_lead_by_the_margin() -> None:
     energy = _double(1.0, 5.0, 5.0, 1.0, 1.0, 5.0, 2.0, 2.0, 9.0)
     predicted = _double(0.5, 0.7, 0.5, 0.7, 0.0, 4.0, 3.0, 1.0, 7.0)
-    # A lead of 0.2 where 1 is wanted, of -0.2, of 4, a tie; the ninth row has no partner.
+    # Differences of 0.2 (margin 1), -0.2, 4, and a tie; the ninth row has no partner.
     losses = rank_loss(predicted, energy, 1.0)
     assert losses.tolist() == pytest.approx([0.8, 1.2, 0.0, 0.0])
     assert ranked_pairs(energy) == 3
@@ -92,16 +92,16 @@ def test_the_paper_s_hybrid_loss_weighs_the_means_of_all_three() -> None:
         config = replace(paper, **changes)  # type: ignore[arg-type]
         return float(network.loss(output, targets, (start, stop), config, 4.0))
 
-    # L_PD: 6, 0.75, 2, 4 and 0 of five rows. L_rank: leads of 3.5 and 0 where 4 is wanted, of two
+    # L_PD: 6, 0.75, 2, 4 and 0 of five rows. L_rank: differences of 3.5 and 0, margin 4, of two
     # pairs; the fifth row has no partner. L_entropy: right three times, wrong twice.
     depth, rank = 12.75 / 5, (0.5 + 4.0) / 2
     entropy = -(3 * math.log(0.75) + 2 * math.log(0.25)) / 5
     assert loss(0, 5) == pytest.approx(5.0 * depth + 2.0 * rank + 2.0 * entropy)
-    # Processes that share a batch add up to the same.
+    # The losses of processes that share a batch have the same sum.
     assert loss(0, 2) + loss(2, 5) == pytest.approx(loss(0, 5))
     assert loss(0, 5, rank_weight=0.0) == pytest.approx(5.0 * depth + 2.0 * entropy)
     assert loss(0, 5, depth_weight=0.0) == pytest.approx(2.0 * rank + 2.0 * entropy)
-    # Without domains there is the sum's error alone: 1, 0.5, 0, 2 and 0.
+    # Without domains, only the sum's error remains: 1, 0.5, 0, 2 and 0.
     undivided = 5.0 * 3.5 / 5 + 2.0 * rank + 2.0 * entropy
     assert loss(0, 5, by_domain=False) == pytest.approx(undivided)
 
@@ -115,7 +115,7 @@ def test_scores_of_eight_poses_worked_by_hand() -> None:
     assert scores.samples == 8
     assert scores.accuracy == 5 / 8
     assert scores.false_positive_rate == 1 / 3
-    # 0.5 is not called colliding.
+    # 0.5 does not count as colliding.
     assert scores.false_negative_rate == 2 / 5
     assert scores.majority_rate == 5 / 8
     assert scores.energy_mse == pytest.approx((0.25 + 1.0 + 1.0) / 8)
@@ -141,12 +141,12 @@ def test_counts_and_curves_of_eight_poses_worked_by_hand() -> None:
     assert counts.shares["precision"] == (3, 4)
     assert counts.shares["recall"] == (3, 4)
     assert counts.shares["accuracy"] == (6, 8)
-    # Of 16 couples of a colliding and a free pose the first leads in 11 and ties in one.
+    # In 16 pairs of a colliding and a free pose, the first scores higher in 11 and equal in one.
     assert area_under_roc(score, colliding) == pytest.approx(11.5 / 16)
     by, of = roc_curve(score, colliding)
     assert by.tolist() == [0.0, 0.0, 0.25, 0.25, 0.5, 0.75, 0.75, 1.0]
     assert of.tolist() == [0.0, 0.25, 0.5, 0.75, 0.75, 0.75, 1.0, 1.0]
-    # A quarter of the recall at precisions of 1, 2 / 3, 3 / 4 and 4 / 7.
+    # A quarter of the recall each at precisions of 1, 2 / 3, 3 / 4 and 4 / 7.
     expected = 0.25 * (1.0 + 2 / 3 + 3 / 4 + 4 / 7)
     assert average_precision(score, colliding) == pytest.approx(expected)
     for same in (np.ones(8, dtype=bool), np.zeros(8, dtype=bool)):
@@ -171,7 +171,7 @@ def test_ranking_score_is_the_mean_shortfall_over_random_pairs() -> None:
     assert right.ranking_margin == 0.0
     silent = measure(np.ones(400), 0.0 * energy, truth, energy, 0.5)
     assert silent.ranking_margin == 0.5
-    # The other way round each pair falls short by its difference and the margin.
+    # In reverse order, each pair's loss is its difference plus the margin.
     reverse = measure(np.ones(400), -energy, truth, energy, 0.5)
     assert reverse.ranking_margin == pytest.approx(0.5 + 400 / 3, rel=0.1)
 

@@ -1,4 +1,4 @@
-"""Where poses are called colliding: free and colliding ones are mistaken equally often."""
+"""The decision threshold, with equal false positive and false negative rates."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from tests.core.predictor_rows import config, made_up_rows
 def _calibrated(
     n_rows: int, shift: float, spread: float, seed: int = 4
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw logits about a shift, and labels that collide as often as these say."""
+    """Draw logits around a shift, and labels with the corresponding probabilities."""
     rng = np.random.default_rng(seed)
     logit = shift + spread * rng.standard_normal(n_rows)
     return logit, rng.uniform(size=n_rows) < 1.0 / (1.0 + np.exp(-logit))
 
 
 def _scores(logit: np.ndarray, colliding: np.ndarray, limit: float) -> tuple[float, float, float]:
-    """Return false alarms, misses and what is right."""
+    """Return the false positive rate, the false negative rate and the accuracy."""
     called = logit > limit
     return (
         float(called[~colliding].mean()),
@@ -56,7 +56,7 @@ def test_both_kinds_are_mistaken_alike_where_that_costs_next_to_nothing(shift: f
 
 
 def test_other_rows_too_see_half_as_many_mistakes_again() -> None:
-    """What is chosen is not the luck of the rows that choose."""
+    """The threshold must not be an accident of the rows that choose it."""
     others = _calibrated(1_000_000, 6.0, spread=4.0, seed=5)
     alarms, missed, right = _scores(*others, 0.0)
     assert alarms > 3.0 * missed
@@ -94,7 +94,7 @@ def test_rows_that_choose_neither_train_nor_measure() -> None:
     np.testing.assert_array_equal(balanced.validation, held_out[::10])
     np.testing.assert_array_equal(np.union1d(balanced.validation, balanced.held_out), held_out)
     assert len(balanced.validation) + len(balanced.held_out) == len(held_out)
-    # A row keeps its side when its store grows.
+    # A row stays in its split when the store grows.
     grown = split_rows(n_rows + 501, chosen)
     np.testing.assert_array_equal(grown.validation[: len(balanced.validation)], balanced.validation)
     few = split_rows(150_000, chosen)
@@ -123,7 +123,7 @@ def test_a_trained_predictor_calls_from_there(
     assert trained.metrics == score_rows(trained, measured).metrics()
     assert trained.metrics is not None
     assert trained.metrics.samples == len(measured) == 1620
-    # What chose stays apart where fewer rows are read, and where the store has grown.
+    # The choosing rows stay separate if fewer rows are read, and if the store has grown.
     choosing = {row.tobytes() for row in chosen_by.latent}
     for n_read, n_measured in ((1000, 270), (6000, 1620)):
         read = rows.taken(held_out_index(n_read, chosen, len(rows)))

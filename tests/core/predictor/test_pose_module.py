@@ -1,4 +1,4 @@
-"""A learned model as a torch module: the same numbers, and their derivatives."""
+"""A learned model as a torch module: equal values, and their derivatives."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.core.predictor_rows import config, made_up_rows
 
 @pytest.fixture(scope="module", params=["paper", "default", "no domains"])
 def model(tube_model: LearnedBody, request: pytest.FixtureRequest) -> LearnedBody:
-    """Return a model with a predictor that was trained for a moment."""
+    """Return a model with a briefly trained predictor."""
     chosen = {
         "paper": config(epochs=1),
         "default": replace(PRESETS["default"], epochs=1, batch_rows=64),
@@ -60,17 +60,17 @@ def test_derivatives_are_those_of_central_differences(model: LearnedBody, part: 
     )
     losses: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
         "vertices": lambda codes: (weights * module(codes).vertices).sum(),
-        # Scaled, for a loss in the size of its step.
+        # Square roots, for a loss of the magnitude of the step.
         "energies": lambda codes: module(codes).domain_energy.sqrt().sum(),
         "logit": lambda codes: (module(codes).collision_logit ** 2).sum(),
         "logit alone": lambda codes: (module.logit(codes) ** 2).sum(),
     }
     loss = losses[part]
-    # Every energy above 0, where its root has a slope.
+    # Every energy must be above 0, where its root is differentiable.
     assert part != "energies" or float(module(latent).domain_energy.detach().min()) > 0.0
     (gradient,) = torch.autograd.grad(loss(latent), latent)
     assert float(gradient.abs().min()) > 0.0
-    # The decoder and the compiled logit work in single precision, the network here in double.
+    # The decoder and the compiled logit use single precision, the network here double.
     steps = {"vertices": 2.0**-6, "logit alone": 2.0**-10}
     step, accuracy = steps.get(part, 2.0**-14), 2e-2 if part in steps else 1e-4
     for row, code in np.ndindex(*latent.shape):
@@ -109,7 +109,7 @@ def test_tensors_with_gradients_are_refused_where_arrays_are_needed(model: Learn
             take(latent)
     with pytest.raises(ShapeError, match="latent is not an array"):
         predictor.logit_and_gradient(latent)
-    # Without one they are arrays.
+    # Without gradients, results are arrays.
     assert np.array_equal(model.decode(latent.detach()), model.decode(latent.detach().numpy()))
 
 

@@ -1,4 +1,4 @@
-"""What a predictor is: the paper's network, its file section, its predictions and gradient."""
+"""The predictor: the paper's network, its file section, predictions and gradient."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def rows(tube_model: LearnedBody) -> LabelRows:
 def predictor(
     tube_model: LearnedBody, rows: LabelRows, request: pytest.FixtureRequest
 ) -> CollisionPredictor:
-    """Return a predictor that was trained for a moment."""
+    """Return a briefly trained predictor."""
     chosen = {
         "paper": config(epochs=1),
         "default": replace(PRESETS["default"], epochs=1, batch_rows=64),
@@ -58,7 +58,7 @@ def test_the_paper_s_preset_is_the_paper_s() -> None:
             schedule="constant",
             batch_rows=32,
             epochs=30,
-            # The paper does not say which weights it kept.
+            # The paper does not state which weights it kept.
             average_passes=8.0,
         )
         == PAPER
@@ -93,7 +93,7 @@ def test_all_collision_predictors_at_once_are_each_on_its_own() -> None:
     for domain, codes in enumerate(latent.split(GROUPS, dim=1)[1:]):
         values = torch.cat([state, codes], dim=1)
         for number, stacked in enumerate(network.predictors):
-            # The first layer's rows past the domain's codes have nothing to multiply.
+            # The first layer's rows beyond the domain's codes are unused.
             weight = stacked.weight[domain, : values.shape[1]]
             values = values @ weight + stacked.bias[domain]
             values = values if number == 4 else relu(values)
@@ -142,7 +142,7 @@ def test_gradient_is_the_logit_s_derivative(predictor: CollisionPredictor, rows:
     for code in range(latent.shape[1]):
         moved = np.zeros_like(latent)
         moved[:, code] = step
-        # In double precision, as the default preset's own logits are single.
+        # In double precision: the default preset's own logits are single.
         ahead, _ = predictor._differentiated(latent + moved)
         behind, _ = predictor._differentiated(latent - moved)
         slope = (ahead - behind) / (2 * step)
@@ -156,7 +156,7 @@ def test_threads_may_share_a_predictor(predictor: CollisionPredictor, rows: Labe
     def both(part: np.ndarray) -> tuple[np.ndarray, ...]:
         return *predictor.scaled_outputs(part), *predictor.logit_and_gradient(part)
 
-    # Torch's products round by how many threads of its own share them out.
+    # The rounding of torch's products depends on its number of threads.
     n_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     expected = [both(part) for part in parts]
@@ -246,7 +246,7 @@ def test_files_of_earlier_versions_are_read(
 def test_floating_point_operations_are_those_of_skin_and_layers(
     predictor: CollisionPredictor,
 ) -> None:
-    """Each row uses every weight, and what poses the skin of the default preset thrice: x, y, z."""
+    """Each row uses every weight; the default preset's skin weights count thrice (x, y, z)."""
     arrays = predictor.arrays
     used = sum(array.size for name, array in arrays.items() if name.endswith(".weight"))
     used += 3 * sum(array.size for name, array in arrays.items() if name == "body.points")

@@ -1,4 +1,4 @@
-"""Stage 2: what it learns, that it does so again, and that nothing interrupts it for good."""
+"""Stage 2: learning, reproducibility and resuming."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def rows(tube_model: LearnedBody) -> LabelRows:
 
 @pytest.mark.parametrize(
     "preset",
-    # The default preset's real training is in the test that follows.
+    # The next test covers the default preset's real training.
     [pytest.param(name, marks=pytest.mark.slow if name == "default" else ()) for name in PRESETS],
 )
 def test_both_presets_learn_what_collides_and_how_deep(
@@ -82,7 +82,7 @@ def test_both_presets_learn_what_collides_and_how_deep(
 
 @pytest.mark.slow
 def test_the_default_preset_learns_real_collisions(tube_model: LearnedBody) -> None:
-    """Patches, folds and labels are all of the same mesh, as they are for who uses it."""
+    """Patches, folds and labels are of the same mesh, as in real use."""
     latent = colliding_latent(tube_model, 2000)
     rows = labeller_of(tube_model).label(latent)
     chosen = replace(PRESETS["default"], batch_rows=64)
@@ -168,7 +168,7 @@ def test_many_rows_are_watched_a_few_at_a_time(tube_model: LearnedBody) -> None:
 def test_progress_ends_at_the_last_step(tube_model: LearnedBody, rows: LabelRows) -> None:
     seen: list[PredictorStatus] = []
     train_predictor(rows, tube_model.embedding, config(epochs=2), job=Job(seen.append))
-    # 1050 rows in batches of 64 are 17 steps an epoch.
+    # 1050 rows in batches of 64 give 17 steps per epoch.
     assert (seen[0].done, seen[0].total, seen[0].loss) == (0, 34, None)
     assert (seen[-1].done, seen[-1].epoch, seen[-1].epochs) == (34, 2, 2)
     assert [status.done for status in seen] == sorted(status.done for status in seen)
@@ -184,7 +184,7 @@ def _stop_training(
     checkpoint: Path,
     is_time: Callable[[PredictorStatus], bool],
 ) -> None:
-    """Train with a checkpoint, and cancel at the first status that it is time at."""
+    """Train with a checkpoint, and cancel at the first status that fulfils a condition."""
     job = Job()
 
     def stop(status: PredictorStatus) -> None:
@@ -224,7 +224,7 @@ def test_a_run_that_stopped_after_an_epoch_shows_the_loss_of_the_next_alone(
 ) -> None:
     monkeypatch.setattr(loop, "_SECONDS_BETWEEN_REPORTS", -1.0)
     embedding, checkpoint = tube_model.embedding, tmp_path / "checkpoint"
-    # What is asked after step 16 is done after step 17, the last of the first epoch.
+    # A cancel after step 16 takes effect after step 17, the last of the first epoch.
     _stop_training(rows, embedding, config(epochs=2), checkpoint, lambda status: status.done == 16)
     resumed, whole = list[PredictorStatus](), list[PredictorStatus]()
     for path, seen in ((checkpoint, resumed), (None, whole)):
@@ -342,14 +342,14 @@ def _written(path: Path, *parts: object) -> Path:
 
 
 def test_the_mean_of_the_weights_is_kept(tube_model: LearnedBody, rows: LabelRows) -> None:
-    """That of every tenth step: the newest count alike at first, then exponentially."""
+    """The mean over every tenth step: uniform at first, then exponential."""
     chosen = config(epochs=1, batch_rows=16, average_passes=0.5)
     n_steps = -(-len(split_rows(len(rows), chosen).training) // 16)
     seen: list[dict[str, np.ndarray]] = []
 
     def look(module: torch.nn.Module, given: object) -> None:  # noqa: ARG001
         if module.training and isinstance(module, PredictorNetwork):
-            # Before a step, the weights are those after the one before.
+            # Before a step, the weights are those after the previous step.
             seen.append({name: part.numpy().copy() for name, part in module.state_dict().items()})
 
     hook = register_module_forward_pre_hook(look)
@@ -393,7 +393,7 @@ def test_a_stopped_run_remembers_its_mean_weights(
 
 
 def test_running_means_never_leave_the_normal_form_of_numbers() -> None:
-    """Of a weight that has a slope in the first step only."""
+    """For a weight that has a gradient only in the first step."""
     weight = torch.nn.Parameter(torch.linspace(-1.0, 1.0, 1000))
     optimiser = torch.optim.Adam([weight], lr=1e-3, fused=True)
     smallest = torch.finfo(torch.float32).tiny
@@ -431,7 +431,7 @@ def test_a_killed_run_goes_on_to_the_same_bits(
 
 
 def _train_in_two(folder: Path, before: str, *job: object) -> None:
-    """Train in two processes; each leaves its result in the file "shared" and its number."""
+    """Train in two processes; each writes its result to a file "shared" plus its rank."""
     script = folder / "train.py"
     script.write_text(before + TRAIN)
     subprocess.run(
@@ -450,7 +450,7 @@ def _train_in_two(folder: Path, before: str, *job: object) -> None:
 def test_two_processes_learn_what_one_does(
     tube_model: LearnedBody, rows: LabelRows, tmp_path: Path
 ) -> None:
-    # One pass, for sums in another order grow apart with every step. Of the 1026 rows to train on,
+    # One epoch, as other orders of summation diverge with every step. Of the 1026 training rows,
     # the last batch has 2: the second process gets none of them.
     embedding, chosen, some = tube_model.embedding, config(epochs=1), rows.taken(slice(1464))
     _train_in_two(tmp_path, "", some, embedding, chosen, tmp_path / "checkpoint")

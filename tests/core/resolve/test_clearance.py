@@ -1,4 +1,4 @@
-"""Poses, drags and motions that keep a distance, by brute force over all pairs."""
+"""Poses, drags and motions that keep a clearance, by brute force over all pairs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def colliding(body: Body) -> FloatArray:
 
 
 def least_by_brute_force(body: Body, vertices: npt.NDArray[np.floating], bound: float) -> float:
-    """Return the least signed distance between parts, infinite from the bound on."""
+    """Return the least signed distance between parts, infinite if it is not below the bound."""
     faces, size = body.topology.faces, body.body_size
     found = signed_distances(vertices.astype(np.float64) / size, faces, bound)
     corners = body.detector.reference[faces] / size
@@ -57,7 +57,7 @@ def test_resolved_poses_keep_the_clearance(body: Body, colliding: FloatArray) ->
             assert least >= 0.002 - 1e-9
         else:
             assert result.least_distance == pytest.approx(least, abs=1e-9)
-        # What is asked for is not exceeded by much, as the pose stays near.
+        # The clearance is not exceeded by much, as the pose stays near.
         touching += least < 1.5 * CLEARANCE
         plain = body.resolve(latent)
         assert plain.least_distance is None
@@ -66,7 +66,7 @@ def test_resolved_poses_keep_the_clearance(body: Body, colliding: FloatArray) ->
 
 
 def test_a_pose_that_is_free_and_too_near_moves(body: Body, colliding: FloatArray) -> None:
-    # Free poses that all but touch: what Resolve leaves without a clearance.
+    # Free poses that nearly touch, as Resolve without a clearance leaves them.
     for latent in colliding:
         near = body.resolve(latent)
         least = least_by_brute_force(body, near.vertices, 0.002)
@@ -156,7 +156,7 @@ def test_a_solid_drag_keeps_the_clearance(body: Body, colliding: FloatArray) -> 
                 if here.settled:
                     break
             least.append(least_by_brute_force(body, here.vertices, 0.004))
-            # It is stopped by contact.
+            # Contact stops it.
             assert len(here.contacts) > 0
     assert min(least[:2]) >= CLEARANCE - 1e-9
     assert max(least[:2]) < 0.004

@@ -1,4 +1,4 @@
-"""Resolve on a small body: each step of the ladder, and what it promises of every result."""
+"""Resolve on a small body: each step of the ladder, and its guarantees."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from tests.core.resolve.toys import Ball, toy_problem
 from tests.core.shapes import random_rotation
 
 FAR = ResolveOptions(largest_change=None)
-"""However far a free pose is: the ladder alone, without the step of least overlap."""
+"""No limit of the displacement: only the ladder, without the step of least overlap."""
 
 MEAN_ALONE = 1
-"""How many of the known free poses are known: the mean pose comes first."""
+"""Number of known free poses used: the mean pose comes first."""
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def check(tube_model: LearnedBody) -> ExactCheck:
 
 @pytest.fixture(scope="module")
 def deep(tube_model: LearnedBody, colliding: FloatArray) -> FloatArray:
-    """Return a pose that neither polishing nor chance frees."""
+    """Return a pose that neither polishing nor luck frees."""
     for latent in colliding:
         alone = resolver_of(tube_model, useless(latent), np.empty((0, 8)))
         if alone.resolve(latent, FAR).step == Step.NONE:
@@ -68,7 +68,7 @@ def deep(tube_model: LearnedBody, colliding: FloatArray) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def shallow(check: ExactCheck, colliding: FloatArray) -> FloatArray:
-    """Return a pose that collides by a hair."""
+    """Return a pose that barely collides."""
     latent = colliding[0]
     return bisect(check, wide_problem(latent), np.zeros_like(latent), latent, 12)[1]
 
@@ -78,12 +78,12 @@ def wide_problem(latent: FloatArray):
 
 
 def useless(latent: FloatArray) -> Ball:
-    """Make a predictor that calls everything colliding and knows no way out."""
+    """Make a predictor that calls everything colliding and shows no way out."""
     return Ball(np.zeros_like(latent), 0.0, sign=-1.0, plateau=0.0)
 
 
 def around_the_mean(latent: FloatArray, radius: float, steepness: float = 100.0) -> Ball:
-    """Make a predictor that calls a ball free, its radius in lengths of the pose."""
+    """Make a predictor that calls a ball around the mean free; its radius is in pose lengths."""
     size = float(np.linalg.norm(latent))
     return Ball(np.zeros_like(latent), radius * size, -1.0, steepness / size)
 
@@ -95,7 +95,7 @@ def resolver_of(
 
 
 def facts(result: ResolveResult) -> dict:
-    """Return all that does not depend on the clock."""
+    """Return all fields that do not depend on the clock."""
     values = asdict(result)
     del values["seconds"]
     arrays = {name: values[name].tobytes() for name in ("latent", "vertices")}
@@ -157,7 +157,7 @@ def test_the_solver_alone(
 @pytest.mark.parametrize("solver", [Solver.SQP, Solver.AUGLAG])
 def test_a_raised_margin(tube_model: LearnedBody, colliding: FloatArray, solver: Solver) -> None:
     latent = colliding[0]
-    # Free, says the predictor, but for a hair: only the margins lead into the free poses.
+    # The predictor calls it almost free: only the margins lead to free poses.
     predictor = around_the_mean(latent, 0.999, steepness=20.0)
     result = resolver_of(tube_model, predictor, np.empty((0, 8))).resolve(
         latent, ResolveOptions(solver=solver)
@@ -186,7 +186,7 @@ def test_polishing_shallow_contact(tube_model: LearnedBody, shallow: FloatArray)
 def test_falling_back_to_a_known_free_pose(
     tube_model: LearnedBody, check: ExactCheck, deep: FloatArray, free_latents: FloatArray
 ) -> None:
-    # Halfway to these it still collides, so that it is no start.
+    # Halfway to these it still collides, so they are not starts.
     halfway = ~check.are_free(0.5 * (free_latents + deep))
     assert halfway.any()
     far = free_latents[halfway]
@@ -195,7 +195,7 @@ def test_falling_back_to_a_known_free_pose(
     assert not result.predicted_free
     assert_free_by_brute_force(tube_model, result)
     assert_measured(tube_model, deep, result)
-    # Pulled back: nearer than any of the poses that it could fall back to.
+    # Pulled back: nearer than any of the fallback poses.
     ways = np.linalg.norm(far - deep, axis=1) / np.linalg.norm(deep)
     assert result.latent_distance < ways.min()
 
@@ -236,7 +236,7 @@ def test_progress_never_sticks(
 
 @pytest.mark.parametrize("solver", Solver)
 def test_the_zero_pose_is_freed(tube_model: LearnedBody, solver: Solver) -> None:
-    """The zero pose has no length to measure by: its distance is the length of the way."""
+    """The zero pose has no length to divide by: its distance is the absolute one."""
     zero, pose = np.zeros(8), tube_model.known_poses[-1]
     size = float(np.linalg.norm(pose))
     predictor = Ball(0.2 * pose, 0.3 * size, steepness=100.0 / size)
@@ -263,7 +263,7 @@ def test_the_neighbours_correction_comes_first(
 def test_pulling_back_beats_bisection(
     tube_model: LearnedBody, check: ExactCheck, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
-    """Without a predictor's help, against the segment to the mean: the baseline of no learning."""
+    """Without a predictor, against bisection to the mean pose: the baseline without learning."""
     ratios = []
     for latent in colliding[:8]:
         problem = wide_problem(latent)
@@ -458,7 +458,7 @@ def test_the_change_of_corrections_is_measured_in_heights(
 
 
 class _Cancelling:
-    """Cancels at one of its evaluations."""
+    """Cancels at one of the evaluations."""
 
     def __init__(self, at_call: int) -> None:
         self.token, self.n_calls, self._at_call = Job(), 0, at_call
@@ -501,7 +501,7 @@ def test_cancelling_many_keeps_what_was_finished(
 
 
 class _CancellingDetector:
-    """Checks as the model's own, and cancels at its second check."""
+    """Checks like the model's own, and cancels at the second check."""
 
     clearance = 0.0
 

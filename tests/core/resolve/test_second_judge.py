@@ -1,4 +1,4 @@
-"""Resolved poses by another library's check of intersections, where it is installed."""
+"""Resolved poses, checked by another library, if it is installed."""
 
 from __future__ import annotations
 

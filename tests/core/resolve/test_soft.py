@@ -1,4 +1,4 @@
-"""The least overlap within a largest change, and depths that pairs of parts tolerate."""
+"""The least overlap within a largest change, and tolerated depths of pairs of parts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def colliding(body: Body) -> FloatArray:
 
 
 def soft(body: Body, latent: FloatArray, most: float) -> ResolveResult:
-    """Resolve within a largest change, and measure by brute force what the result says."""
+    """Resolve within a largest change, and verify the result by brute force."""
     result = body.resolve(latent, ResolveOptions(largest_change=most))
     ends = body.decode(np.stack([latent, result.latent])) / body.body_size
     change = np.linalg.norm(ends[1] - ends[0], axis=1).max()
@@ -59,7 +59,7 @@ def test_the_overlap_falls_within_the_bound(body: Body, colliding: FloatArray) -
         for result, most in zip(results, (0.005, 0.02), strict=True):
             assert result.largest_change == most
             if plain.vertex_distance_max <= most:
-                # Resolve's own answer is near enough.
+                # The plain result is near enough.
                 assert result.step == plain.step
                 np.testing.assert_array_equal(result.latent, plain.latent)
                 gone += 1
@@ -146,12 +146,12 @@ def test_steps_out_of_contact_end_in_a_nearer_pose_than_is_known_or_none() -> No
 def test_a_largest_change_is_checked() -> None:
     with pytest.raises(LCollisionError, match="a largest change needs the exact check"):
         ResolveOptions(largest_change=0.1, verify=False)
-    # The default does not ask for it.
+    # The default works without the exact check.
     assert not ResolveOptions(verify=False).verify
 
 
 def deepest_by_parts(body: Body, vertices: np.ndarray) -> dict[frozenset[int], float]:
-    """Return the depth of the deepest pair of faces of each two domains, by brute force."""
+    """Return the largest depth of each pair of domains, by brute force."""
     size = body.body_size
     found = all_pairs(vertices.astype(np.float64), body.faces, DEPTH_TOLERANCE * size)
     owner = body.space.vertex_domain[body.faces[:, 0]]
@@ -180,9 +180,9 @@ def test_a_belly_gives_and_a_hand_does_not(body: Body) -> None:
         left = deepest_by_parts(body, result.vertices)
         assert set(left) <= gives
         assert 0.0 < max(left.values()) <= tolerated
-        # It is nearer than what leaves no overlap.
+        # It is nearer than the result without overlap.
         assert result.vertex_distance_mean < body.resolve(latent).vertex_distance_mean
-        # From there a drag goes no deeper.
+        # A drag from there goes no deeper.
         dragger.begin(result.latent, None, options=DragOptions(solid=True))
         for _ in range(3):
             end = dragger.move(latent)

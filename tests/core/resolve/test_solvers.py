@@ -1,4 +1,4 @@
-"""The solvers on problems whose nearest point is known."""
+"""The solvers on problems with known nearest points."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def solve(solver: Solver, problem: ResolveProblem, margin: float = 0.0) -> Solve
 
 
 def nearest_below(offset: float) -> FloatArray:
-    """Return the point of the half-space NORMAL . Z <= offset that is nearest to TARGET."""
+    """Return the nearest point to TARGET in the half-space NORMAL . Z <= offset."""
     excess = NORMAL @ TARGET - offset
     nearest: FloatArray = TARGET - excess * NORMAL / (NORMAL @ NORMAL)
     return nearest
@@ -74,8 +74,8 @@ def test_bounds_hold_and_the_other_codes_make_up_for_them(solver: Solver) -> Non
     problem = toy_problem(HalfSpace(NORMAL, -4.0), TARGET)
     problem.low = np.array([0.0, -10.0, -10.0, -10.0])
     problem.high = np.array([10.0, 10.0, 10.0, 1.0])
-    # The first code and the last stop at their bounds, 0 and 1, so that the second has to give
-    # the rest: 0 + z - 2 = -4.
+    # The first and the last code stop at their bounds, 0 and 1, and the second gives the rest, as
+    # 0 + z - 2 = -4.
     outcome = solve(solver, problem)
     assert outcome.feasible
     np.testing.assert_allclose(outcome.latent, [0.0, -2.0, -1.0, 1.0], atol=3e-2)
@@ -104,10 +104,10 @@ def test_what_cannot_be_reached_ends_in_the_nearest_corner_with_a_status(solver:
     problem = toy_problem(HalfSpace(NORMAL, -1e3), TARGET, bound=2.0)
     outcome = solve(solver, problem)
     assert not outcome.feasible
-    # NLopt's solvers each end in a way of their own.
+    # NLopt's solvers end with different statuses.
     assert outcome.status == "stopped" if solver == Solver.SQP else outcome.status
     assert (np.abs(outcome.latent) <= 2.0).all()
-    # Of the codes that do not count, the one of the target.
+    # Codes with a zero in NORMAL keep the target's value.
     np.testing.assert_allclose(outcome.latent, [-2.0, -2.0, -1.0, 2.0], atol=1e-6)
 
 
@@ -130,7 +130,7 @@ def test_cancel_stops_before_the_next_evaluation(solver: Solver, at_call: int) -
             calls += 1
             if calls == at_call:
                 token.cancel()
-            # Curved, so that no solver is there after one step.
+            # Curved, so that no solver converges in one step.
             return 81.0 - (latent**2).sum(axis=1), -2.0 * latent
 
     problem = toy_problem(Cancelling(), TARGET, deadline=Deadline(job=token))
@@ -187,7 +187,7 @@ def test_from_the_zero_pose(solver: Solver) -> None:
 
 @pytest.mark.parametrize("solver", Solver)
 def test_slopes_that_mislead_end_with_the_best_pose_so_far(solver: Solver) -> None:
-    """AUGLAG's inner LBFGS fails on these, and NLopt raises."""
+    """AUGLAG's inner L-BFGS fails on these, and NLopt raises."""
 
     class Misleading:
         def logit_and_gradient(self, latent: npt.NDArray) -> tuple[FloatArray, FloatArray]:

@@ -24,7 +24,7 @@ def heights(model: RigBody, latent: FloatArray) -> FloatArray:
 
 
 def crouching(model: RigBody, thigh: float = 2.2, knee: float = 2.4) -> FloatArray:
-    """Return a pose with the thighs in the trunk and the feet where they stand at rest."""
+    """Return a pose with the thighs in the trunk and the feet where they are at rest."""
     space: RigPoseSpace = model.space
     names = space.rig.joint_names
     codes = np.zeros(model.latent_size)
@@ -59,7 +59,7 @@ def test_a_locked_trunk_is_not_moved(body: RigBody) -> None:
 
 
 def change(model: RigBody, latent: FloatArray, pose: FloatArray) -> float:
-    """Return how far the vertex that moved most did, normalised."""
+    """Return the largest displacement of a vertex, normalised."""
     moved = model.space.decode(latent[None])[0] - model.space.decode(pose[None])[0]
     return float(np.linalg.norm(moved, axis=1).max())
 
@@ -80,7 +80,7 @@ def test_feet_move_where_keeping_them_moves_the_body_too_far(body: RigBody) -> N
 
 @pytest.mark.parametrize("most", [0.02, 0.03])
 def test_a_pose_of_less_overlap_does_not_sink_unsaid(body: RigBody, most: float) -> None:
-    """It is moved up as a whole, if no vertex moves too far by that."""
+    """It is moved up as a whole unless that moves a vertex too far."""
     pose = crouching(body)
     ground = heights(body, pose).min()
     result = body.resolve(pose, ResolveOptions(standing=body.up, largest_change=most))

@@ -1,4 +1,4 @@
-"""Messages that are damaged or make no sense: one sentence each, and the engine stays."""
+"""Damaged or meaningless messages: one sentence each, and the engine keeps running."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ N_DAMAGED = 300
 
 
 class Raw:
-    """A process that bytes are sent to as they are."""
+    """An engine process that receives raw bytes."""
 
     def __init__(self) -> None:
         self.process = subprocess.Popen(
@@ -51,7 +51,7 @@ class Raw:
         return reply
 
     def end(self) -> tuple[int, str]:
-        """End the input; return the status and what was said on standard error."""
+        """Close the input; return the exit status and standard error."""
         _, errors = self.process.communicate(timeout=60.0)
         return self.process.returncode, errors.decode()
 
@@ -61,7 +61,7 @@ def hello(number: int = 1) -> bytes:
 
 
 def plain(values: Any) -> Any:
-    """Wrap the arrays of a message."""
+    """Encode the arrays of a message."""
     if isinstance(values, dict):
         return {key: plain(one) for key, one in values.items()}
     if isinstance(values, list):
@@ -70,7 +70,7 @@ def plain(values: Any) -> Any:
 
 
 def requests() -> list[Reply]:
-    """Return a request of each kind that carries arrays or texts."""
+    """Return a request of each kind with arrays or texts."""
     body = as_arrays(rigged_body())
     pose = np.array(body["rest"])
     told: list[Reply] = [
@@ -85,7 +85,7 @@ def requests() -> list[Reply]:
 
 
 def damaged(generator: np.random.Generator, request: Reply, number: int) -> bytes:
-    """Return a message that is not one, or not that request: bytes or values are changed."""
+    """Return a damaged request: its bytes or values are changed."""
     request = {**request, "id": number}
     kind = int(generator.integers(6))
     keys = [key for key in request if key != "id"]
@@ -123,7 +123,7 @@ def test_damaged_messages_get_one_sentence_each_and_the_engine_stays() -> None:
         replies = [engine.reply()]
         while replies[-1]["id"] != number + 1 or replies[-1]["type"] != "hello":
             replies.append(engine.reply())
-        # Work answers later than a greeting; nothing here may succeed but what still is a request.
+        # Replies may come after the greeting's; only messages that are still valid may succeed.
         if len(replies) == 1:
             replies.insert(0, engine.reply())
         assert len(replies) == 2, replies
@@ -144,7 +144,7 @@ def test_damaged_messages_get_one_sentence_each_and_the_engine_stays() -> None:
 
 
 class Counted(io.BufferedReader):
-    """Counts how often it is read."""
+    """Counts the read calls."""
 
     n_reads = 0
 
@@ -158,7 +158,7 @@ def test_a_message_that_is_too_long_is_skipped_in_pieces(rest: bytes) -> None:
     n = MAX_LENGTH + 1
     head = MARK + struct.pack("<I", n)
     data = head + bytes(100_000) + rest + framed(b"first") + framed(b"second")
-    # So that the mark lies across two of its pieces for some of the rests.
+    # Some remainders make the mark straddle two of its chunks.
     stream = Counted(io.BytesIO(data), 2273)  # type: ignore[arg-type]
     reader = FrameReader(stream)
     with pytest.raises(LCollisionError, match="bytes long"):

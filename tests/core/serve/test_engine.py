@@ -1,4 +1,4 @@
-"""The engine as a process of its own, asked by the client."""
+"""The engine as a separate process, used by the client."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def opened(engine: Engine) -> Reply:
 
 
 def test_poses_of_a_client_s_joints_are_skinned() -> None:
-    """As `dataset make` and proposals of rules ask for them."""
+    """As for `dataset make` and rule proposals."""
     fields = as_arrays(BODY) | {"poses": np.array(TRANSFORMS[:3])}
     plain = msgspec.msgpack.encode({"type": "open_mesh", "id": 0, **fields}, enc_hook=Array.of)
     message = msgspec.msgpack.decode(plain, type=OpenMesh)
@@ -62,7 +62,7 @@ def test_poses_of_a_client_s_joints_are_skinned() -> None:
 
 
 def moved(transforms: FloatArray, reply: Reply) -> FloatArray:
-    """Turn the joints of a (J, 4, 4) pose as a reply says, and return the vertices."""
+    """Turn the joints of a (J, 4, 4) pose by a reply's turns, and return the vertices."""
     assert RIG is not None
     turns = dict(zip(array(reply["joints"]).tolist(), array(reply["turns"]), strict=True))
     placed = np.empty_like(transforms)
@@ -74,10 +74,10 @@ def moved(transforms: FloatArray, reply: Reply) -> FloatArray:
 
 
 def crossing_the_arm(vertices: FloatArray) -> list[tuple[int, int]]:
-    """Return the crossing pairs of which one face is the left arm's and the other is not.
+    """Return the crossing pairs between the left arm and the rest.
 
-    The arm is far from all else at rest and hangs on a joint that moves no mesh, so that no rule
-    leaves them out.
+    At rest, the arm is far from everything else, and its parent joint moves no mesh, so no rule
+    excludes these pairs.
     """
     arm = set(ARM_FACES.tolist())
     return [pair for pair in crossing_pairs(vertices, FACES) if len(arm & set(pair)) == 1]
@@ -96,7 +96,7 @@ def test_a_character_is_known_by_the_hash_of_what_it_is_made_of(
 
 
 def in_a_thread() -> Engine:
-    """Return an engine that lives in this process, and ends with the conversation."""
+    """Return an engine that runs in a thread of this process, and ends with the connection."""
     asked, ask = (os.fdopen(end, mode) for end, mode in zip(os.pipe(), ("rb", "wb"), strict=True))
     told, tell = (os.fdopen(end, mode) for end, mode in zip(os.pipe(), ("rb", "wb"), strict=True))
 
@@ -168,7 +168,7 @@ def test_the_way_to_a_pose_is_checked_as_well(engine: Engine, opened: Reply) -> 
         return found
 
     rest = np.array(BODY.rest_vertices)
-    # An arm comes through the trunk from far on the other side.
+    # An arm passes through the trunk from far on the other side.
     across, arm = rest.copy(), np.unique(FACES[ARM_FACES])
     across[arm] += np.array([-3.0, 0.0, 0.0]) * np.ptp(rest, axis=0).max()
     assert touches(across)
@@ -221,7 +221,7 @@ def test_joints_turn_alone_if_they_are_said_to(engine: Engine, opened: Reply) ->
     for one in (reply, motion):
         turned = {opened["joints"][joint] for joint in array(one["joints"]).tolist()}
         assert turned == {"LeftArm"}
-    # What the forearm alone can't free stays as it was, and is named.
+    # Frames that the forearm alone cannot free stay unchanged, and are named.
     asked["turning"] = ["LeftForeArm"]
     stays = engine.ask("resolve_motion", transforms=TRANSFORMS, times=TIMES, **asked)
     assert (len(array(stays["joints"])), stays["spans"]) == (0, [])
@@ -256,7 +256,7 @@ def test_places_that_touch_in_nearly_every_pose_are_proposed_and_left_out(
     engine: Engine, opened: Reply
 ) -> None:
     character = opened["character"]
-    # The arm hangs in the trunk in all of these poses, about the same place.
+    # The arm is in the trunk in all of these poses, at about the same place.
     shown = np.array([skinned(RIG, TRANSFORMS[20]) for _ in range(8)])
     reply = engine.ask("propose_rules", character=character, vertices=shown)
     assert (reply["poses"], reply["colliding"], reply["colliding_then"]) == (8, 8, 0)
@@ -358,7 +358,7 @@ def test_joints_that_hardly_turn_stay_where_that_makes_nothing_worse(
 
 
 def of_frame(reply: Reply, row: int) -> Any:
-    """Return the turns of one frame as the engine answers them."""
+    """Return the turns of one frame of a reply."""
     turns = np.ascontiguousarray(array(reply["turns"])[row])
     return {"dtype": "<f8", "shape": turns.shape, "data": turns.tobytes()}
 
@@ -440,7 +440,7 @@ def test_a_request_is_cancelled_and_the_engine_goes_on(engine: Engine, opened: R
         )
         for _ in range(2)
     )
-    # Checks are not behind it.
+    # Checks do not queue behind it.
     assert engine.ask("check", character=opened["character"], transforms=TRANSFORMS[0])
     assert not request.is_done
     engine.cancel(waiting)
@@ -482,7 +482,7 @@ def test_what_waits_for_an_engine_that_is_ended_is_told_so() -> None:
         transforms=np.tile(TRANSFORMS, (n, 1, 1, 1)),
         times=np.arange(n * len(TIMES)) / 30.0,
     )
-    # The engine cancels what it does when its input ends; nobody has asked for that.
+    # The engine cancels its work when its input ends, without a cancel request.
     one.close(0.0)
     with pytest.raises(EngineError, match=r"^the engine is gone$"):
         request.result(60.0)
@@ -566,7 +566,7 @@ def test_a_stopped_engine_is_ended_though_more_is_sent_than_its_pipe_holds(
     monkeypatch.setattr(client.subprocess, "Popen", started)
     monkeypatch.setattr(client, "_SILENCE", 1.0)
     with start() as engine:
-        # It answers what it is not busy with, so that a long request is not taken for a hung one.
+        # It answers other requests meanwhile, so a long request does not count as hung.
         opened = engine.ask("open_mesh", **as_arrays(BODY))
         asked = {"character": opened["character"], "times": np.arange(10 * len(TIMES)) / 30.0}
         moving = np.tile(TRANSFORMS, (10, 1, 1, 1))

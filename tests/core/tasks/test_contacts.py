@@ -1,4 +1,4 @@
-"""Contact rules that are proposed from the poses."""
+"""Contact rules proposed from poses."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def colliding_share(poses: PoseSet) -> float:
 
 
 def two_tubes() -> PoseSet:
-    """Return poses of a tube that bends beside a second one that always stands in it."""
+    """Return poses of a bending tube, and a second one that always penetrates it."""
     poses, topology = bending_tube(12, most=0.6), tube_topology()
     post = bent_tube(0.0, 0.0) * [0.4, 0.15, 0.4] + [0.05, 0.02, 0.0]
     still = np.repeat(post[None] * LENGTH_IN_FILES + PLACE_IN_FILES, len(poses), axis=0)

@@ -1,4 +1,4 @@
-"""A new latent space looked at again, by the first samples of its box."""
+"""Revision of a new latent space by the first samples of its box."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def trained(poses: PoseSet) -> LearnedBody:
 
 @pytest.fixture(scope="module")
 def always_touching() -> LearnedBody:
-    """Return a model of a tube that stands in another, with no contact rules."""
+    """Return a model of a tube that penetrates another, without contact rules."""
     return trained(two_tubes())
 
 
@@ -61,7 +61,7 @@ def test_layers_stay_on_what_they_cover_all_over_the_box() -> None:
     first = model.n_vertices - len(covered)
     drawn = model.decode(first_samples(model, 0)[:64]) / model.body_size
     away = np.linalg.norm(drawn[:, first:] - drawn[:, covered], axis=2)
-    # 0.01 at rest; joined by a few edges it moves by 0.05.
+    # The distance is 0.01 at rest; joined by only a few edges, it would change by 0.05.
     assert np.abs(away - 0.01).max() < 0.02
     assert np.abs(away - 0.01).mean() < 0.002
 
@@ -106,7 +106,7 @@ def test_a_run_stops_before_the_predictor_where_nearly_all_samples_collide(
     assert (status.state, status.stage) == (RunState.FAILED, Stage.LATENT_SPACE)
     assert status.mostly_collides
     assert not work.labels.exists()
-    # Other options need another folder while a run goes on, and not after this.
+    # Other options need another folder while a run is unfinished, but not after this.
     other = replace(request, left_out=("component 2",))
     work.go_on_regardless()
     assert work.request.regardless
@@ -136,7 +136,7 @@ def test_after_that_parts_can_be_left_out_under_the_same_name(
 def test_what_a_sample_takes_corrects_the_estimate() -> None:
     before = estimated_seconds(5000, 100, Quality.QUICK, 2)
     after = estimated_seconds(5000, 100, Quality.QUICK, 2, row_seconds=0.1, colliding_share=1.0)
-    # Of a block of 32 mixed samples six poses more are looked at on the way.
+    # A block of 32 mixed samples checks six additional poses.
     assert after[Stage.LABELS] == pytest.approx(SMALL.n_samples * 0.1 * 38 / 32)
     assert after[Stage.PREDICTOR] > before[Stage.PREDICTOR] + 0.7 * SMALL.n_samples * 0.1
     fewer = estimated_seconds(5000, 100, Quality.QUICK, 2, row_seconds=0.1, colliding_share=0.1)

@@ -1,4 +1,4 @@
-"""From a pose set to a trained model in one run, which goes on however it is stopped."""
+"""From a pose set to a trained model in one run that resumes however it is stopped."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def request_for_tube(tmp_path: Path, tube_poses: PoseSet) -> LearningRequest:
 def whole(
     tmp_path_factory: pytest.TempPathFactory, tube_poses: PoseSet
 ) -> tuple[WorkFolder, LearnedCard, list[LearningStatus]]:
-    """Return a run that nothing stopped: its folder, its card and what it told."""
+    """Return an uninterrupted run: its folder, its card and its statuses."""
     folder, told = tmp_path_factory.mktemp("whole"), []
     write_pose_set(folder / "tube.npz", tube_poses)
     with pytest.MonkeyPatch.context() as patch:
@@ -67,7 +67,7 @@ def work_in(folder: Path, request: LearningRequest, name: str = "tube") -> WorkF
 
 
 def numbers_of(path: str) -> tuple[str, bytes]:
-    """Return what tells the latent space and the predictor of a model."""
+    """Return values that identify a model's latent space and predictor."""
     model = LearnedBody.load(path)
     return model.fingerprint, model.predict(model.known_poses).collision_logit.tobytes()
 
@@ -87,7 +87,7 @@ def test_a_run_ends_with_a_model_that_resolves(
     assert told[0].done < 0.1
     assert told[-1].done > 0.99
     assert all(seconds > 0.0 for seconds in card.seconds.values())
-    # The status stays for a window that looks later, and nothing large.
+    # The status is kept for windows that look later, but nothing large.
     assert work.status.state == RunState.DONE
     assert work.status.model == card.model
     assert not work.poses.exists()
@@ -119,7 +119,7 @@ def test_a_run_that_is_cancelled_anywhere_goes_on_to_the_same_model(
             assert work.status.state == RunState.STOPPED
             assert work.status.done <= stop + 0.3
         else:
-            # What is left after the last steps were done is nothing to cancel.
+            # After the last step, there is nothing left to cancel.
             assert stop > 0.7
             break
         assert not work.is_held
@@ -166,7 +166,7 @@ def test_a_run_that_is_killed_goes_on_to_the_same_model(
         assert work.is_held
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
-        # A killed process cannot say so: nobody holds what is said to run.
+        # A killed process cannot report it: the status is running, but nobody holds the folder.
         assert work.status.state == RunState.RUNNING
         assert not work.is_held
     killed = learn_model(work)
@@ -204,7 +204,7 @@ def test_what_another_request_made_or_makes_is_not_touched(
     failing = replace(request_for_tube, sources=(str(tmp_path / "none.npz"),))
     with pytest.raises(MeshFileError):
         learn_model(work_in(tmp_path, failing))
-    # What failed before it had poses gives way, and a run that waits for its turn does not.
+    # A run that failed before it had poses is replaced, but not one that waits for its turn.
     work = work_in(tmp_path, request_for_tube)
     assert work.status.state == RunState.STOPPED
     with pytest.raises(ModelFileError, match=r"being learned from other files or options"):

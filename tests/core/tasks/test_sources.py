@@ -26,7 +26,7 @@ def still(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def moving(tmp_path: Path) -> Path:
-    """Return the same character with 12 frames, of which two and two are alike."""
+    """Return the same character with 12 frames, equal in pairs."""
     return write_gltf(rigged_body(n_frames=12), tmp_path / "moving.gltf")
 
 
@@ -56,7 +56,7 @@ def test_little_animation_is_topped_up(still: Path, moving: Path) -> None:
     assert len(gather_poses([moving], by_rig=0, thin=False)) == len(read)
     np.testing.assert_array_equal(poses.vertices[0], read.vertices[0])
     assert (poses.up_axis, poses.source) == (read.up_axis, moving)
-    # Of the rig, so that a learned model and its character agree.
+    # The rig's rules, so that a learned model and its character agree.
     assert poses.rules == open_body(moving).rules
     assert {group.name for group in poses.groups} >= {group.name for group in read.groups}
 
@@ -76,13 +76,13 @@ def test_the_rest_pose_of_the_rig_is_first_wherever_its_file_is_named(
     np.testing.assert_array_equal(poses.vertices[0], rest)
     assert poses.names[0] == "still rest"
     assert poses.source == still
-    # The set holds what the cache holds, and the rest pose, elsewhere.
+    # The set contains the cache's poses and the rest pose, at another position.
     all_names = gather_poses(files, by_rig=0, thin=False).names
     assert len(all_names) == 1 + 4 + 13
     assert "set rest" in all_names
     assert "set rest" not in poses.names
     assert any("left out" in note for note in poses.notes)
-    # Each name has its file's before it, once.
+    # Each name is prefixed by its file's name, once.
     topped_up = gather_poses(files, by_rig=3)
     assert topped_up.names[-3:] == ("still rig 1", "still rig 2", "still rig 3")
     assert topped_up.names[:-3] == poses.names
