@@ -233,7 +233,7 @@ def cut_at_a_seam(body: Character, name: str) -> Character:
 def _nearest_bones(
     points: FloatArray, places: FloatArray, parents: npt.NDArray[np.int64], names: tuple[str, ...]
 ) -> npt.NDArray[np.intp]:
-    """Return for each point the joint whose bone, to one of its children, is nearest to it."""
+    """Return, for each point, the joint with the nearest bone to one of its children."""
     away = np.full((len(points), len(names)), np.inf)
     for joint, parent in enumerate(parents):
         if parent < 0:

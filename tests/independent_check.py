@@ -176,7 +176,7 @@ class IndependentRules:
         return (a in first and b in second) or (b in first and a in second)
 
     def _is_of_rest(self, a: int, b: int, radius: float) -> bool:
-        """Whether a face near a touches one near b at rest."""
+        """Whether, at rest, a face near a touches a face near b."""
         by_b = self._faces_around(b, radius)
         return any(self._touched.get(face, set()) & by_b for face in self._faces_around(a, radius))
 

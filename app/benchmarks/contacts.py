@@ -99,7 +99,7 @@ def built(build: str) -> tuple[RigBody, Template]:
 
 
 def dances(body: RigBody, template: Template) -> list[Motion]:
-    """Return three motions of a built body: a dance, a jump, and hands put to the belly."""
+    """Return three motions of a built body: a dance, a jump, and hands put on the belly."""
     skeleton = template.skeleton
     figures = {
         "dance": swing_motion()[:_FRAMES],
@@ -144,7 +144,7 @@ def score_contacts(
     workers: int | None = None,
     job: Job = UNWATCHED,
 ) -> list[Row]:
-    """Move one motion onto other bodies, with and without its contacts."""
+    """Score one motion moved onto other bodies, with and without keeping its contacts."""
     rows: list[Row] = []
     for body in bodies:
         copied = moved_onto(body, source, motion)

@@ -29,7 +29,7 @@ from lcollision_core.motion import screen_motion
 _ROUNDS = 5
 
 Loop = Callable[[int], object]
-"""Called with the number of threads."""
+"""A loop, called with the number of threads."""
 
 
 def loops_of(body: Body, n_items: int, data: Path | None) -> dict[str, tuple[int, Loop]]:

@@ -117,7 +117,7 @@ def _run(model: Path, n_actions: int) -> Row:
 
     Parameters
     ----------
-    n_actions : random actions; `START` only starts it, `DROP` times a drop
+    n_actions : number of random actions; `START` only starts the editor, `DROP` times a drop
     """
     with tempfile.TemporaryDirectory() as folder:
         environment = {

@@ -83,7 +83,7 @@ class CollidingPoses:
 
 
 def sampled_poses(model: Body, n_poses: int, seed: int, job: Job = UNWATCHED) -> CollidingPoses:
-    """Draw colliding poses from the latent box."""
+    """Draw colliding poses by the model's own sampling."""
     latents = sample_poses(model, n_poses, seed, colliding=True, job=job)
     return CollidingPoses(latents, [None] * n_poses)
 

@@ -1,1 +1,1 @@
-"""The pose that is edited: document, history, commands, recovery, settings. Signals, no widget."""
+"""The edited pose: document, history, commands, recovery, settings; signals but no widgets."""

@@ -1,4 +1,4 @@
-"""Commands of a document, and the history that undoes and redoes them."""
+"""Undo commands of a document, and its history."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ class MotionEdits(Protocol):
         """Whether no motion has changed since it was read or exported."""
 
     def mark_saved(self) -> None:
-        """Count all motions as saved."""
+        """Mark all motions as saved."""
 
 
 @dataclass(eq=False)
@@ -478,7 +478,7 @@ class PoseHistory(QObject):
         self.apply(state)
 
     def keep_saved(self, asked: NamedPose, pose: NamedPose, file: Path) -> None:
-        """Record that a file now holds a pose, and in the undo steps if it is still current.
+        """Record that `file` now contains a pose; amend the undo steps if it is still current.
 
         Parameters
         ----------

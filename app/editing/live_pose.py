@@ -241,7 +241,7 @@ class PoseMotion(QObject):
 
     @property
     def dragging(self) -> bool:
-        """Whether the hand holds the body."""
+        """Whether a drag of the body is in progress."""
         moving = self._moving
         return moving is not None and moving.start.grip is not None and not moving.has_ended
 
@@ -623,7 +623,7 @@ class PoseMotion(QObject):
         if moving is None or self.frame is None:
             return
         if moving.start.grip is not None:
-            # No hand presses against the contacts any more.
+            # The drag no longer presses against contacts.
             self.frame = replace(self.frame, contacts=no_points(), standing=no_points())
         elif not was_moving:
             return

@@ -76,7 +76,7 @@ class Playback(QObject):
 
     @property
     def playing(self) -> bool:
-        """Whether it plays."""
+        """Whether playback is running."""
         return self._tick.isActive()
 
     def play(self, motion: Motion, start: int, first: int, last: int) -> None:

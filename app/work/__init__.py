@@ -1,1 +1,1 @@
-"""Threads behind the window, and what runs in them: the live pose, long jobs, frames."""
+"""The threads behind the window and their work: the live pose, long jobs, frames."""

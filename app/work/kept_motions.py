@@ -75,7 +75,7 @@ class _KeptMotion:
 
 @dataclass(frozen=True)
 class _Kept:
-    """`EditedMotions` as a file holds them."""
+    """`EditedMotions` as stored in a file."""
 
     file: str
     stamp: tuple[int, int, int, int] | None

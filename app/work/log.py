@@ -76,7 +76,7 @@ def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
 
 
 def unexpected(error: BaseException) -> Failure:
-    """Report a bug of the program."""
+    """Return the failure that reports a bug of the program."""
     return Failure(
         f"unexpected error ({type(error).__name__}: {error})",
         "save your pose under a new name, and see the log file for details",

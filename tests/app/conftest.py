@@ -105,7 +105,7 @@ def _releases_its_buttons() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def editor_model(tmp_path_factory: pytest.TempPathFactory) -> LearnedBody:
-    """Return a small model with a predictor, and nothing left to compile for its frames."""
+    """Return a small model with a predictor, warmed up so that its frames need no compiling."""
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         # All workers use the model that the first of them trains.

@@ -305,7 +305,7 @@ N_POINTS, WIDTH, N_MANY = 24, 4, 20
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread() -> Iterator[None]:
-    """Keep torch from waking its threads for a handful of numbers, thousands of times."""
+    """Keep torch from waking its threads thousands of times for a few numbers."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

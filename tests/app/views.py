@@ -157,7 +157,7 @@ def roll(
     notches: float,
     keys: Qt.KeyboardModifier = Qt.KeyboardModifier.NoModifier,
 ) -> None:
-    """Turn the wheel, or move two fingers on a touchpad, over a place of the canvas."""
+    """Turn the wheel, or move two fingers on a touchpad, over a position on the canvas."""
     turned = QPoint(0, round(120 * notches))
     no_buttons = Qt.MouseButton.NoButton
     phase, where = Qt.ScrollPhase.NoScrollPhase, canvas.mapToGlobal(place)

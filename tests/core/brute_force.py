@@ -113,7 +113,7 @@ def all_pairs(vertices: npt.ArrayLike, faces: npt.ArrayLike, tolerance: float) -
         a, b = np.nonzero(straddles)
         a = rows[a]
         blocks.append(np.stack([a, b], axis=1))
-    # A pair stays where each face has corners on both sides of the other's plane.
+    # A pair is kept if each face has corners on both sides of the other's plane.
     candidates = np.concatenate(blocks)
     keys = candidates[:, 0] * len(triangles) + candidates[:, 1]
     reverse = candidates[:, 1] * len(triangles) + candidates[:, 0]

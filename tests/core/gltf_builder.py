@@ -77,7 +77,7 @@ class GltfBuilder:
         self.add("animations", name=name, samplers=samplers, channels=targets)
 
     def write(self, path: Path) -> Path:
-        """Write a .glb, or a .gltf with its data inside."""
+        """Write a .glb, or a .gltf with embedded data."""
         described = self.description | {"buffers": [{"byteLength": len(self.blob)}]}
         if "scenes" not in described:
             children = {c for node in described["nodes"] for c in node.get("children", ())}

@@ -33,7 +33,7 @@ def show(corners: np.ndarray, colours: np.ndarray, objects: set[str]) -> None:
 
 
 def clear() -> None:
-    """Show nothing."""
+    """Show no triangles."""
     show(np.empty((0, 3)), np.empty((0, 4)), set())
 
 

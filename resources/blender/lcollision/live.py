@@ -54,7 +54,7 @@ def _on_load(*_: object) -> None:
 def register() -> None:
     """Follow loaded files, and resume the check if it was on when the add-on was disabled."""
     bpy.app.handlers.load_post.append(_on_load)
-    # Scenes cannot be read yet.
+    # Scenes cannot be read during registration.
     bpy.app.timers.register(_on_load, first_interval=0.0)
 
 

@@ -23,7 +23,7 @@ OFF_RIG = 1e-4
 """Offset, in body sizes, above which a mesh counts as moved by more than its bones."""
 
 HIDDEN, UNTICKED = "hidden", "not ticked"
-"""Why a mesh of a character is not checked."""
+"""Reasons why a mesh of a character is not checked."""
 _FLAT = 1e-9
 """An armature whose axes span less than this share of an orthogonal volume has no depth."""
 

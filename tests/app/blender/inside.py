@@ -361,7 +361,7 @@ def driven(path):
 def clearance(path, clip, metres):
     """Check and resolve a pose and an action with a clearance."""
     armature = load(path)
-    # In another unit than the scene's.
+    # In a unit other than the scene's.
     armature.scale = (0.5, 0.5, 0.5)
     lower_arm(armature)
     assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
@@ -720,7 +720,7 @@ class Recorder:
             if name in ("row", "box", "column"):
                 return Recorder(self._lines, is_sentence=named.get("align", False))
             line = named.get("text") or " ".join(map(str, arguments))
-            # 220 pixels, less the tabs, the margins and the icon.
+            # 220 pixels minus the tabs, the margins and the icon.
             blf.size(0, bpy.context.preferences.ui_styles[0].widget.points)
             room = 170.0 - 20.0 * (named.get("icon", "NONE") != "NONE")
             if name == "label" and blf.dimensions(0, line)[0] > room:

@@ -41,7 +41,7 @@ def test_outside_of_the_spans_nothing_changes_and_the_old_action_is_kept(
     assert added
     assert max(added.values()) < 15
     assert set(told["old_keys"].values()) == {3}
-    # The user's action stays in the file, though nothing uses it.
+    # The user's action stays in the file, although nothing uses it.
     old, new = told["actions"]
     (done, (level, said)) = told["said"]
     assert (done, level) == (["FINISHED"], "INFO")

@@ -38,7 +38,7 @@ def test_frames_and_vertices_are_those_of_blender_at_any_rate(tmp_path: Path) ->
         frames = character.sample(clip, character.rate(clip))
         assert len(frames.times) == count
         assert np.allclose(np.diff(frames.times), base / fps, rtol=1e-6)
-        # Blender's z is up, and its y runs to the back.
+        # In Blender, z is up and y points backwards.
         x, y, z = np.moveaxis(frames.vertices[:, character.joined] * character.metres, -1, 0)
         vertices, expected = np.stack([x, -z, y], axis=-1), np.array(told[name])
         assert np.ptp(expected, axis=0).max() > 0.1

@@ -30,7 +30,7 @@ def test_posed_faces_are_those_of_blender(tmp_path: Path) -> None:
     source.write_clip(clip, expected, list(codes), ExportRequest(fps=30.0))
     for path, wanted in ((posed, expected[2:3]), (clip, expected)):
         told = in_blender(tmp_path, "played", path, len(wanted), script="inside_shapes.py")
-        # Blender's z is up, and its y runs to the back.
+        # In Blender, z is up and y points backwards.
         x, y, z = np.moveaxis(np.array(told), -1, 0)
         shown = np.stack([x, z, -y], axis=-1)
         assert np.abs(shown - wanted[:, body.character.joined]).max() < 1e-5 * body.body_size

@@ -97,7 +97,7 @@ def test_others_find_the_same_file_with_new_keys_in_one_clip(source: Path, free:
     assert changed[0] != changed[1]
     assert kept[0] == kept[1]
     assert len(kept[0]) > 0
-    # What the specification asks of keys: their times ascend, and turns have length 1.
+    # The specification requires ascending times and rotations of length 1.
     for sampler in after.animations[0].samplers:
         times = np.frombuffer(bytes_of(after, sampler.input), np.float32)
         assert (np.diff(times) > 0.0).all()

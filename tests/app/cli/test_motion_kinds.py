@@ -259,7 +259,7 @@ def test_a_long_motion_killed_twice_goes_on_from_its_last_span(
     command = ("resolve", source, *chosen, "-o", free)
     kept = tmp_path / "free.glb.partial.json"
     n_kept = 0
-    # In the first span, and in the last.
+    # Break the first span, and the last.
     for at in (20, 80):
         process = subprocess.run(
             [sys.executable, "-c", _STOP_IN_THE_MIDDLE, str(at), *map(str, command)],

@@ -37,7 +37,7 @@ def test_the_window_is_painted_only_once_all_follows_the_pose(
     bars = [row.bar for row in window.collision.prediction.rows]
     free = np.array(document.history.latent)
     colliding = sample_poses(document.model, 1, 0, colliding=True)[0]
-    # After the first of these frames the next is known to be quick.
+    # After the first of these frames, the next one is known to be quick.
     document.motion.blend_towards(0.5 * colliding, 1.0)
     rest(qtbot, window)
     done: list[str] = []

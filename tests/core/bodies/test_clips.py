@@ -229,7 +229,7 @@ def test_a_clip_is_checked_and_resolved_into_the_characters_own_file(
     (row,) = resolve_motions(request, Job())
     assert row.free_before < row.free_after == N_FRAMES
     clips = [animation["name"] for animation in described(out)["animations"]]
-    # The new one comes first, and the character's own stay.
+    # The new clip comes first, and the character's own clips stay.
     assert clips == [f"{CLIP} 2", CLIP, OTHER]
     (free,) = check_clips(out, CheckRequest(motion=MotionChoice(clip=f"{CLIP} 2")))
     assert (free.frames, free.colliding_frames) == (N_FRAMES, [])

@@ -274,7 +274,7 @@ def test_meshes_in_another_unit_are_refused(model: LearnedBody, scale: float) ->
 
 
 def test_meshes_that_are_no_pose_are_fitted_as_well_as_may_be(model: LearnedBody) -> None:
-    """Flat and mirrored meshes get finite codes and an error that says so."""
+    """Flat and mirrored meshes get finite codes and a large fit error."""
     mesh = model.decode(_box(model, 1)[0])
     for foreign in (
         mesh * [1.0, 0.0, 1.0],

@@ -100,7 +100,7 @@ def test_plates_that_always_touch_are_left_out_and_an_arm_in_the_breastplate_is_
     middle = body.reference[body.faces].mean(axis=1)[np.array(proposed.new)][:, :, 0]
     assert (middle.max(axis=1) > 0.0).sum() == (middle.max(axis=1) < 0.0).sum()
     assert ("LeftArm", "left bracer") in proposed.places
-    # An arm sunk into the breastplate, far and farther; some of it lies at the shoulder.
+    # An arm sinks deeper and deeper into the breastplate; some of it is at the shoulder.
     breastplate = faces_of(body, "breastplate")
     for angle in (-1.9, 1.9, -2.1, 2.1):
         found = other.detector.detect(other.decode(with_turned(other, "LeftArm", 1, angle)))

@@ -226,7 +226,7 @@ HUMAN = {
         )
     },
 }
-"""Joints of the body of tubes by the bones of VRM."""
+"""Joints of the body of tubes, by VRM bone."""
 
 
 def as_vrma(character: Path, path: Path, bones: dict[str, str] = HUMAN) -> Path:

@@ -272,7 +272,7 @@ def test_a_morph_target_joins_those_that_are_there(tmp_path: Path) -> None:
     assert description["meshes"][1]["weights"] == [0.25, 1.0]
     assert description["nodes"][5]["weights"] == [0.5, 1.0]
     assert description["meshes"][1]["extras"] == {"targetNames": ["smile", "pose"]}
-    # One of its primitives may have none.
+    # One of the mesh's primitives may have no targets.
     del mesh["primitives"][0]["targets"]
     character = read_character(builder.write(tmp_path / "figure.glb"))
     _, posed = _written(character, CharacterForm.MORPH, path)

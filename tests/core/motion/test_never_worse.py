@@ -74,7 +74,7 @@ def require_no_worse(
 
 
 def figure(n_arms: int, radius: float) -> tuple[Rig, Topology, FloatArray]:
-    """Return a trunk of two joints, and arms of two joints beside it."""
+    """Return a trunk of two joints, with arms of two joints each."""
     names, parents, places = ["Hips", "Spine"], [-1, 0], [[0.0, 0.0, 0.4], [0.0, 0.0, 0.7]]
     limbs = [([0, 1], [0.0, 0.0, 1.2], 0.12)]
     for sign in (1.0, -1.0)[:n_arms]:

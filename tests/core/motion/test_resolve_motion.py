@@ -101,7 +101,7 @@ def test_an_arm_that_passes_through_the_trunk_between_two_free_frames_goes_round
     assert (after.colliding, after.in_between) == ((), ())
     outside = [frame for frame in range(len(motion)) if frame not in found.spans[0]]
     assert found.motion.codes[outside].tobytes() == motion.codes[outside].tobytes()
-    # Without poses between frames, nothing is wrong with it.
+    # Without in-between poses, no collision is found.
     assert resolve_motion(body.resolver, motion, UP, replace(OPTIONS, substeps=0)).spans == ()
     # Nor if only the frames on one side may change.
     assert resolve_motion(body.resolver, motion, UP, OPTIONS, within=range(14)).spans == ()

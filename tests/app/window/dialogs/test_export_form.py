@@ -1,4 +1,4 @@
-"""The form of an export: what it offers, remembers and does."""
+"""The export form: its choices, remembered settings and results."""
 
 from __future__ import annotations
 
