@@ -7,7 +7,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, zip_longest
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -36,10 +36,7 @@ from lcollision_core.meshes.face_groups import MAX_GROUPS
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import digest_of
 from lcollision_core.posing import ExactCheck, PoseSpace
-from lcollision_core.resolve import PoseResolver
-
-if TYPE_CHECKING:
-    from lcollision_core.resolve.problem import CollisionModel
+from lcollision_core.resolve import BodyAlone, PoseResolver
 
 _GAP = 0.01
 """Normalised gap between bodies in poses that are assumed to be free."""
@@ -102,7 +99,7 @@ class SceneMember:
     Attributes
     ----------
     name : unique in the scene
-    body : a character, a prop with one joint, or a static body
+    body : a character, a learned model, a prop with one joint, or a static body
     place : from its unit and coordinates to those of the scene
     is_fixed : whether it must not move
     holder, joint : for a held body, the name of its holder and the index of the holder's joint;
@@ -121,7 +118,8 @@ class SceneMember:
     @property
     def moves(self) -> bool:
         """Whether it has codes."""
-        return self.holder is None and self.body.joints is not None
+        has_codes = self.body.joints is not None or self.body.is_trained
+        return self.holder is None and has_codes
 
     @property
     def is_rigid(self) -> bool:
@@ -242,9 +240,11 @@ class SceneBody(Body):
             stop = start + n_vertices + moved_member.body.n_vertices
             self.vertices_of[moved_member.name] = slice(start + n_vertices, stop)
             n_vertices += moved_member.body.n_vertices
-        space: PoseSpace | None = body.joints
-        if space is None:
-            space = StillSpace(body.topology, body.reference / body.body_size)
+        space: PoseSpace = (
+            body.space
+            if member.moves
+            else StillSpace(body.topology, body.reference / body.body_size)
+        )
         topology, n_vertices = body.topology, body.n_vertices
         for number, moved_member in enumerate(held_members, 1):
             n_vertices += moved_member.body.n_vertices
@@ -274,9 +274,10 @@ class SceneBody(Body):
         left_out: list[str] = []
         tolerated: list[tuple[str, str, float]] = []
         touching: list[tuple[int, int]] = []
-        posed = [
-            member.body.rules for member in self.members if member.moves and _bends(member.body)
-        ]
+        bending = [member.body for member in self.members if member.moves and _bends(member.body)]
+        # Joints crease what they turn: without their exclusions characters collide at rest.
+        jointed = [body for body in bending if body.joints is not None]
+        posed = [body.rules for body in jointed or bending]
         still = [member.name for member in self.members if member.is_fixed and not member.is_ground]
         domains = self._space.vertex_domain
         for member in self.members:
@@ -573,7 +574,10 @@ class SceneBody(Body):
         up = np.eye(3)[self.up_axis]
         decoded = self._space.decode(latent[None])[0]
         meshes = [decoded[own] for own in self._space.vertices]
-        movable = [member.moves and not member.is_fixed for member in self.standing]
+        movable = [
+            member.moves and not member.is_fixed and placed.has_place
+            for member, placed in zip(self.standing, self._space.members, strict=True)
+        ]
         if not any(movable):
             return []
         ground = [
@@ -616,7 +620,38 @@ class SceneBody(Body):
     @cached_property
     def resolver(self) -> PoseResolver:
         """Resolves collisions within and between bodies."""
-        return SceneResolver(self.exact_check(), None, self.free_latent, self.starts)
+        bodies = self._alone.values() if self._own_rules_hold else ()
+        return SceneResolver(self.exact_check(), self.free_latent, self.starts, tuple(bodies))
+
+    @property
+    def _own_rules_hold(self) -> bool:
+        """Whether each body keeps its own contact rules in the scene."""
+        rules, own = self.rules, self.own_rules
+        more = set(rules.left_out).difference(own.left_out)
+        return replace(rules, left_out=own.left_out) == own and more.isdisjoint(self._alone)
+
+    @cached_property
+    def _alone(self) -> dict[str, BodyAlone]:
+        """The bodies that bend and are not fixed, by name, each with the props that it holds."""
+        alone = {}
+        for at, member in enumerate(self.standing):
+            if not member.moves or member.is_fixed or not _bends(member.body):
+                continue
+            body, place = member.body, self._space.members[at].place
+            if not body.can_resolve:
+                continue
+            holds = [other for other in self.members if other.holder == member.name]
+            if holds and len(self.standing) > 1:
+                body = SceneBody([member, *holds])
+                place = RigidTransform(np.eye(3), np.zeros(3), body.body_size / self._size)
+            alone[member.name] = BodyAlone(
+                body.resolver,
+                self._space.codes[at],
+                self._space.domains[at],
+                place,
+                lambda space, at=at: cast("SceneSpace", space).members[at].space,  # type: ignore[misc]
+            )
+        return alone
 
     def starts(self, target: FloatArray, check: ExactCheck) -> FloatArray:
         """Return poses near a (D,) target with resolved bodies apart; they may still collide.
@@ -631,9 +666,9 @@ class SceneBody(Body):
 
         latent = target.copy()
         options = ResolveOptions(clearance=check.clearance)
-        for member, own in zip(self.standing, self._space.codes, strict=True):
-            if member.moves and not member.is_fixed and _bends(member.body):
-                latent[own] = member.body.resolve(target[own], options).latent
+        for body in self._alone.values():
+            found = body.resolver.resolve(target[body.codes], body.options(options))
+            latent[body.codes] = found.latent
         return np.array(self.apart(latent)).reshape(-1, self.latent_size)
 
 
@@ -647,8 +682,9 @@ class SceneResolver(PoseResolver):
 
     Parameters
     ----------
-    check, predictor, free_latents : see `PoseResolver`
+    check, free_latents : see `PoseResolver`
     starts : maps a target and the check to further starting poses
+    bodies : those that can be resolved separately
     """
 
     # Poses with the bodies apart are far from the target, and slow to find and to leave.
@@ -657,12 +693,12 @@ class SceneResolver(PoseResolver):
     def __init__(
         self,
         check: ExactCheck,
-        predictor: CollisionModel | None,
         free_latents: npt.ArrayLike,
         starts: Callable[[FloatArray, ExactCheck], FloatArray],
+        bodies: tuple[BodyAlone, ...],
     ) -> None:
-        super().__init__(check, predictor, free_latents)
-        self._starts = starts
+        super().__init__(check, None, free_latents)
+        self._starts, self.bodies = starts, bodies
 
     def _known_free(self, target: FloatArray) -> FloatArray:
         return np.concatenate([self._starts(target, self.check), super()._known_free(target)])
@@ -674,8 +710,8 @@ def _in_body(body: str, part: str) -> str:
 
 
 def _bends(body: Body) -> bool:
-    """Whether a body has joints that turn relative to each other."""
-    return body.joints is not None and len(body.space.low) > body.space.group_sizes[0]
+    """Whether a posable body has parts that move relative to each other."""
+    return len(body.space.low) > body.space.group_sizes[0]
 
 
 def _of_codes(member: SceneMember, what: str) -> Sequence[Any]:

@@ -150,8 +150,7 @@ def body_of_scene(
 
     Raises
     ------
-    LCollisionError : a file cannot be read, a learned model is not fixed, or a holder or its joint
-        is unknown.
+    LCollisionError : a file cannot be read, or a holder or its joint is unknown.
     """
     known = [*opened, *[None] * (len(scene.bodies) - len(opened))]
     pairs = list(zip(scene.bodies, known, strict=True))
@@ -161,14 +160,7 @@ def body_of_scene(
     members: list[SceneMember] = []
     for part, name, body in zip(scene.bodies, names, bodies, strict=True):
         place = _place(part, body, first)
-        is_fixed = part.fixed
-        if body.joints is None and not is_fixed and not as_posed:
-            raise LCollisionError(
-                "is a learned model, which can stand in a scene but not move with others",
-                f"add --fixed {name}, or name the character that it was learned from",
-                where=name,
-            )
-        member = SceneMember(name, body, place, is_fixed)
+        member = SceneMember(name, body, place, part.fixed)
         if part.held_by:
             member = _held(member, part, members, bring=not as_posed)
         members.append(member)

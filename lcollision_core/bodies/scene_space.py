@@ -102,6 +102,11 @@ class PlacedSpace:
     space: PoseSpace
     place: RigidTransform
 
+    @property
+    def has_place(self) -> bool:
+        """Whether codes of its own move the whole body, as those of a learned model do not."""
+        return self.space.group_sizes[0] == ROOT_CODES and self.space.limbs.is_relative
+
     @cached_property
     def _turns(self) -> bool:
         return not np.array_equal(self.place.rotation, np.eye(3))
@@ -177,7 +182,7 @@ class SceneSpace:
         )
         reach = _REACH + float(np.ptp(self.rest_vertices, axis=0).max())
         for member, places in zip(members, self.codes, strict=True):
-            if member.space.group_sizes[0] == ROOT_CODES:
+            if member.has_place:
                 self.high[places[:3]] = reach / member.place.scale
                 self.low[places[:3]] = -reach / member.place.scale
 

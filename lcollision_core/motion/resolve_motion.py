@@ -26,7 +26,7 @@ from lcollision_core.motion.motion import (
 )
 from lcollision_core.motion.span_program import SMOOTHNESS, SpanProgram, TimeKernel
 from lcollision_core.options import MotionOptions
-from lcollision_core.resolve import PoseResolver
+from lcollision_core.resolve import BodyAlone, PoseResolver
 from lcollision_core.resolve.problem import single_torch_thread
 
 WINDOW, OVERLAP = 120, 24
@@ -104,6 +104,9 @@ def resolve_motion(
     out, and the frames around them are resolved without them. They then get the least overlap found
     within the limits, or stay unchanged to the bit.
 
+    In a scene, each body is resolved separately first, and then the spans that still collide, as
+    where bodies meet. If that makes a frame worse, all bodies are resolved together from the start.
+
     Parameters
     ----------
     resolver : of the body's poses
@@ -137,22 +140,104 @@ def resolve_motion(
         ThreadPoolExecutor(n_workers, "motion frames") as pool,
         ThreadPoolExecutor(n_workers, "motion spans") as outer,
     ):
-        is_cycle = motion.is_cycle
-        frames = Frames(
-            motion.two_turns() if is_cycle else motion,
-            resolver,
-            replace(chosen.frame, largest_change=None),
-            pool,
-            job.part() if stop is None else Job(None, job, stop),
-            chosen.continuous,
-            largest_change=chosen.frame.largest_change,
-            kept_contacts=_contacts_of(motion, chosen),
-        )
-        chosen_frames = range(len(motion)) if within is None else within
-        run = _Resolution.begin(motion, frames, chosen, chosen_frames, up, Job(checking))
-        run.job, run.stop, run.done, run.keep = job, stop, done or {}, keep
-        run.outer = outer
+        watched = job.part() if stop is None else Job(None, job, stop)
+
+        def begin(motion: Motion, job_of_check: Job, checking: Job) -> _Resolution:
+            is_cycle = motion.is_cycle
+            frames = Frames(
+                motion.two_turns() if is_cycle else motion,
+                resolver,
+                replace(chosen.frame, largest_change=None),
+                pool,
+                job_of_check,
+                chosen.continuous,
+                largest_change=chosen.frame.largest_change,
+                kept_contacts=_contacts_of(motion, chosen),
+            )
+            chosen_frames = range(len(motion)) if within is None else within
+            run = _Resolution.begin(motion, frames, chosen, chosen_frames, up, checking)
+            # Finished frames are judged after a stop too.
+            run.guard = replace(run.guard, frames=replace(frames, job=job.part()))
+            run.frames, run.outer = replace(frames, job=watched), outer
+            run.job, run.stop, run.done, run.keep = job, stop, done or {}, keep
+            return run
+
+        run = begin(motion, watched, Job(checking))
+        bodies = [body for body in resolver.bodies if not body.is_locked(chosen.frame)]
+        is_plain = motion.placements is None and motion.hidden is None and motion.contacts is None
+        if len(bodies) > 1 and is_plain and run.wanted.any():
+            reports = _Reports(job, len(bodies) + 1)
+            each = _each_by_itself(run, bodies, up, workers, reports)
+            together = begin(each, job.part(), UNWATCHED)
+            together.job = job.part(reports.of(len(bodies)))
+            resolved = run.judged(together.result())
+            if resolved is not None:
+                return resolved
+            run.done, run.keep = {}, None
         return run.result()
+
+
+class _Reports:
+    """Progress of successive stages as one: frames done, and all frames known so far."""
+
+    def __init__(self, job: Job, n_stages: int) -> None:
+        self._job, self._totals = job, [0] * n_stages
+
+    def of(self, stage: int) -> Callable[[int, int], None]:
+        """Return the report of one stage."""
+
+        def report(n_done: int, n_frames: int) -> None:
+            self._totals[stage] = n_frames
+            self._job.report(sum(self._totals[:stage]) + n_done, sum(self._totals))
+
+        return report
+
+
+def _each_by_itself(
+    run: _Resolution,
+    bodies: Sequence[BodyAlone],
+    up: npt.ArrayLike,
+    workers: int | None,
+    reports: _Reports,
+) -> Motion:
+    """Return the motion of a scene with the self-collisions of each body resolved.
+
+    Most collisions are within one body, and alone it is cheaper to decode, search and solve. After a
+    stop the remaining bodies stay unchanged.
+    """
+    motion, options, space_at = run.motion, run.options, run.motion.space_at
+    codes = np.array(motion.codes)
+    for number, body in enumerate(bodies):
+        own, feet = body.space_in, body.own_domains(options.feet)
+        of_body = replace(
+            motion,
+            codes=motion.codes[:, body.codes],
+            space_at=None if space_at is None else lambda time, own=own: own(space_at(time)),  # type: ignore[misc]
+        )
+        of_options = replace(
+            options,
+            frame=body.options(options.frame),
+            feet=feet,
+            keep_feet=options.keep_feet and (not options.feet or bool(feet)),
+        )
+        job, axis = run.job.part(reports.of(number)), np.asarray(up) @ body.place.rotation
+        try:
+            resolved = resolve_motion(
+                body.resolver,
+                of_body,
+                axis,
+                of_options,
+                workers,
+                job,
+                within=run.within,
+                stop=run.stop,
+            )
+        except CancelledError:
+            if run.job.cancelled:
+                raise
+            break
+        codes[:, body.codes] = resolved.motion.codes
+    return replace(motion, codes=codes)
 
 
 @dataclass(eq=False)
@@ -259,8 +344,6 @@ class _Resolution:
 
     def result(self) -> ResolvedMotion:
         """Solve all spans, until none is worse than the original."""
-        # Finished frames are judged after a stop too.
-        self.guard = replace(self.guard, frames=replace(self.frames, job=self.job.part()))
         again = np.arange(len(self.motion)) % self.n
         todo, touching = self._spans(), np.empty(0, dtype=np.intp)
         n_rounds = 0
@@ -300,6 +383,14 @@ class _Resolution:
             self._kept(),
         )
 
+    def judged(self, other: ResolvedMotion) -> ResolvedMotion | None:
+        """Return another result for the motion; None if it makes a frame worse than the original."""
+        codes, after = other.motion.codes, other.after[: self.n].copy()
+        if self.guard.faults(range(self.n), codes[: self.n], after, self._fractions):
+            return None
+        spans = tuple(runs((codes != self.motion.codes).any(axis=1)))
+        return replace(other, before=self.before, spans=spans, standing=self.standing)
+
     @property
     def _is_stopped(self) -> bool:
         return self.stop is not None and self.stop.cancelled
@@ -314,12 +405,12 @@ class _Resolution:
         return SMOOTHNESS * (self.motion.rate / NOMINAL_RATE) ** 4
 
     @property
-    def _wanted(self) -> npt.NDArray[np.bool_]:
+    def wanted(self) -> npt.NDArray[np.bool_]:
         """(n,) frames that should change."""
         return self.colliding | self.apart
 
     def _spans(self) -> list[range]:
-        return colliding_spans(self._wanted, self._easing, self.within, self.is_cycle, self.barred)
+        return colliding_spans(self.wanted, self._easing, self.within, self.is_cycle, self.barred)
 
     def _own(self, span: range) -> npt.NDArray[np.intp]:
         """Return the indices of a span's frames, modulo n."""
@@ -353,7 +444,7 @@ class _Resolution:
         """
         own, n_solved = self._own(span), self.solved.pop(span, 0)
         targets, solutions = self.motion.codes[own], self.codes[own]
-        collides = self._wanted[own]
+        collides = self.wanted[own]
         self._put_back(span)
         if self.is_cycle and len(span) == self.n:
             return span

@@ -3,6 +3,7 @@
 from lcollision_core.options import Metric, ResolveOptions, Solver
 from lcollision_core.resolve.resolver import (
     ALL_LOCKED,
+    BodyAlone,
     PoseResolver,
     ResolveResult,
     Step,

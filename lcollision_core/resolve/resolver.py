@@ -23,7 +23,7 @@ from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.options import Metric, ResolveOptions, Solver
-from lcollision_core.posing import ExactCheck
+from lcollision_core.posing import ExactCheck, PoseSpace
 from lcollision_core.resolve.problem import (
     CollisionModel,
     Deadline,
@@ -432,6 +432,54 @@ def relative_distance(latent: FloatArray, target: FloatArray) -> float:
     return float(np.linalg.norm(latent - target)) / (float(np.linalg.norm(target)) or 1.0)
 
 
+_MOST_CLEARANCE = 0.5
+"""Normalised: the largest clearance of a body that is small in its scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class BodyAlone:
+    """A body of a scene that is resolved separately.
+
+    Attributes
+    ----------
+    resolver : of its own poses
+    codes : (D_k,) where its codes are among those of the scene
+    domains : its body parts among those of the scene
+    place : from its normalised coordinates to those of the scene
+    space_in : its poses among those of the scene
+    """
+
+    resolver: PoseResolver
+    codes: npt.NDArray[np.intp]
+    domains: range
+    place: RigidTransform
+    space_in: Callable[[PoseSpace], PoseSpace]
+
+    def is_locked(self, options: ResolveOptions) -> bool:
+        """Whether options of the scene lock all of it."""
+        return options.locked_domains.issuperset(self.domains)
+
+    def own_domains(self, domains: frozenset[int]) -> frozenset[int]:
+        """Return its own indices of those scene domains that are its own."""
+        return frozenset(part - self.domains.start for part in domains if part in self.domains)
+
+    def options(self, options: ResolveOptions) -> ResolveOptions:
+        """Convert the scene's options to its own lengths, indices and axes."""
+        scale, weights, up = self.place.scale, options.group_weights, options.standing
+        most, locked = options.largest_change, options.locked_codes
+        own = self.domains.start + 1, self.domains.stop + 1
+        return replace(
+            options,
+            clearance=min(options.clearance / scale, _MOST_CLEARANCE),
+            largest_change=None if most is None else most / scale,
+            locked_domains=self.own_domains(options.locked_domains),
+            still_domains=self.own_domains(options.still_domains),
+            locked_codes=frozenset(np.flatnonzero(np.isin(self.codes, list(locked))).tolist()),
+            group_weights=None if weights is None else (weights[0], *weights[slice(*own)]),
+            standing=None if up is None else tuple((up @ self.place.rotation).tolist()),
+        )
+
+
 STILL_WEIGHT = 1e4
 """Weight of the squared displacement of parts that should stay: feet then slide by less than a
 thousandth of a percent per frame. Locking their codes instead leaves poses colliding."""
@@ -451,8 +499,10 @@ class PoseResolver:
     Attributes
     ----------
     check : as given
+    bodies : those of a scene that can be resolved separately; empty for a single body
     """
 
+    bodies: tuple[BodyAlone, ...] = ()
     _pushes_first = False
 
     def __init__(

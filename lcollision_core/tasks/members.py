@@ -99,7 +99,7 @@ def written_members(
     members = [
         member
         for member in body.members
-        if member.body.own_file is not None and not member.is_fixed
+        if (member.moves or member.body.own_file is not None) and not member.is_fixed
     ]
     for member, stem in zip(members, file_stems(member.name for member in members), strict=True):
         own = member.body.own_file

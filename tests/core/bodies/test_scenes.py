@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.sparse import random as random_sparse
 
-from lcollision_core.bodies import open_body
+from lcollision_core.bodies import NamedPose, open_body
 from lcollision_core.bodies.scene_body import SceneBody, SceneFile, ScenePart
 from lcollision_core.bodies.scene_file import (
     body_of_scene,
@@ -20,9 +20,11 @@ from lcollision_core.bodies.scene_file import (
 )
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.files import write_mesh
-from lcollision_core.options import ResolveOptions
+from lcollision_core.options import ExportRequest, ResolveOptions
 from lcollision_core.posing import DragOptions, Grip
+from lcollision_core.tasks.members import write_members
 from tests.rigged_shapes import rigged_body, write_gltf
+from tests.small_models import DATA
 
 _BOX = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 _BOX_FACES = np.array(
@@ -59,6 +61,33 @@ def test_codes_are_those_of_the_bodies_and_move_their_vertices_alone(two: SceneB
     assert np.allclose(decoded[two.vertices_of["hero"]], hero.decode(codes[0]))
     villain = hero.decode(codes[1]) * [-1.0, 1.0, -1.0] + [0.5, 0.02, 0.0]
     assert np.allclose(decoded[two.vertices_of["villain"]], villain)
+
+
+def test_a_learned_body_is_posed_by_its_codes(folder: Path) -> None:
+    tube = DATA / "tube.safetensors"
+    model, codes = open_body(tube), 0.5 * open_body(tube).sample(1, np.random.default_rng(3))[0]
+    at = model.decode(codes)[len(model.reference) // 2]
+    parts = ScenePart(str(tube)), ScenePart(str(folder / "hero.glb"), at=tuple(at - [0, 1, 0]))
+    body = body_of_scene(SceneFile(parts))
+    latent = body.joined_codes([codes, None])
+    rows, place = body.vertices_of["tube"], body.member("tube").place
+    assert np.allclose(body.decode(latent)[rows], place.apply(model.decode(codes)))
+    by_vertices = np.random.default_rng(1).normal(size=(1, body.n_vertices, 3))
+    pulled = body.codes_of_member("tube", body.space.pull_back(latent, by_vertices))
+    assert np.allclose(pulled, model.space.pull_back(codes, by_vertices[:, rows]))
+    result = body.resolve(latent)
+    assert result.pairs_before
+    assert result.exactly_free
+    written = write_members(
+        folder / "out", body, [NamedPose("free", result.latent)], [result.vertices], ExportRequest()
+    )
+    assert np.allclose(written[0].vertices, result.vertices, atol=1e-4)
+    assert (folder / "out" / "tube.obj").is_file()
+    dragger, hand = body.dragger(), int(rows.start + model.reference[:, 1].argmax())
+    dragger.begin(result.latent, Grip.at(hand))
+    moved = dragger.move(body.decode(result.latent)[hand] + [0.0, 0.0, 9.0]).latent
+    assert body.codes_of_member("tube", moved - result.latent).any()
+    assert not body.codes_of_member("hero", moved - result.latent).any()
 
 
 def test_derivatives_are_those_of_differences(two: SceneBody) -> None:
