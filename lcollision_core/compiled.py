@@ -1,15 +1,14 @@
-"""Decorators that compile loops with numba."""
+"""Decorators that compile loops with numba, which is imported when the first one is called."""
 
 from __future__ import annotations
 
 import logging
 import math
+import threading
 import time
 from collections.abc import Callable
-from typing import TypeVar, cast
-
-import numba
-from numba.core import event
+from functools import cache, cached_property
+from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -47,28 +46,70 @@ def compiled_sums(function: Function) -> Function:
     return _compiled(function, fastmath={"reassoc", "contract", "nsz"})
 
 
+def inlined(function: Callable[..., object]) -> Any:
+    """Write the loop of a small function into each compiled one that calls it."""
+    return _Loop(function, cache=False, inline="always", error_model="numpy")
+
+
 def _compiled(
     function: Function, fastmath: bool | set[str], no_cpython_wrapper: bool = False
 ) -> Function:
-    options = {
-        "nogil": True,
-        "error_model": "numpy",
-        "fastmath": fastmath,
-        "no_cpython_wrapper": no_cpython_wrapper,
+    loop = _Loop(
+        function,
+        cache=True,
+        nogil=True,
+        error_model="numpy",
+        fastmath=fastmath,
+        no_cpython_wrapper=no_cpython_wrapper,
         # Nothing calls these functions from C.
-        "no_cfunc_wrapper": True,
-    }
-    try:
-        dispatcher = numba.njit(cache=True, **options)(function)
-    except RuntimeError:
-        # Neither the installation nor the user's cache folder is writable, as for a service
-        # account without a home. Start slowly every time rather than not at all.
-        dispatcher = numba.njit(**options)(function)
-    return cast(Function, dispatcher)
+        no_cfunc_wrapper=True,
+    )
+    return cast(Function, loop)
 
 
-class _Compilations(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Logs when compiling begins, again after a pause, and adds up the time that it takes.
+class _Loop:
+    """A function that numba compiles when it is first called.
+
+    Importing numba takes half a second, which commands that only read and print are spared.
+    """
+
+    def __init__(self, function: Callable[..., object], cache: bool, **options: object) -> None:
+        self.py_func = function
+        self._cache, self._options = cache, options
+
+    @cached_property
+    def _made(self) -> Any:
+        with _making:
+            try:
+                return _numba().njit(cache=self._cache, **self._options)(self.py_func)
+            except RuntimeError:
+                # Neither the installation nor the user's cache folder is writable, as for a service
+                # account without a home. Start slowly every time rather than not at all.
+                return _numba().njit(**self._options)(self.py_func)
+
+    def __call__(self, *args: object) -> object:
+        return self._made(*args)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of numba's function: numba asks for them when another loop calls this."""
+        return getattr(self._made, name)
+
+
+_making = threading.Lock()
+
+
+@cache
+def _numba() -> Any:
+    import numba
+    from numba.core import event
+
+    event.Listener.register(_Compilations)
+    event.register("numba:compile", _compilations)
+    return numba
+
+
+class _Compilations:
+    """Logs that compiling begins, after a pause again, and adds up how long it takes.
 
     Loading from the cache does not count. Numba compiles one function at a time, with its callees
     nested in it.
@@ -78,22 +119,21 @@ class _Compilations(event.Listener):  # type: ignore[misc]  # numba has no types
         self.seconds = 0.0
         self._last, self._started, self._depth = -math.inf, 0.0, 0
 
-    def on_start(self, _: object) -> None:
+    def notify(self, event: Any) -> None:
         now = time.monotonic()
+        if event.is_end:
+            self._depth, self._last = self._depth - 1, now
+            if self._depth == 0:
+                self.seconds += now - self._started
+            return
         if now - self._last > _PAUSE_SECONDS:
             _log.info("compiling for this processor, which takes some seconds once")
         if self._depth == 0:
             self._started = now
         self._depth, self._last = self._depth + 1, now
 
-    def on_end(self, _: object) -> None:
-        self._depth, self._last = self._depth - 1, time.monotonic()
-        if self._depth == 0:
-            self.seconds += self._last - self._started
-
 
 _compilations = _Compilations()
-event.register("numba:compile", _compilations)
 
 
 def seconds_compiling() -> float:

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy import sparse
 from scipy.sparse import csgraph, csr_matrix, linalg
 
@@ -29,7 +28,7 @@ from lcollision_core.acap.features import (
     push_forward,
 )
 from lcollision_core.acap.rotations import component_roots, consistent_logarithms, split_gradients
-from lcollision_core.compiled import compiled, compiled_part
+from lcollision_core.compiled import compiled, compiled_part, inlined
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import for_blocks
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, edge_graph, length_graph
@@ -231,7 +230,7 @@ def _substitute_many(poisson: Poisson, sides: FloatArray) -> None:
     sides[n_free:] = 0.0
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def load_gradient(poisson, gradients, i, column, sides):  # type: ignore[no-untyped-def]
     """Write b_i of a pose's (V, 3, 3) deformation gradients to three columns of `sides` (V, n)."""
     x, y, z = 0.0, 0.0, 0.0

@@ -22,9 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from lcollision_core.compiled import compiled, compiled_part
+from lcollision_core.compiled import compiled, compiled_part, inlined
 from lcollision_core.contact.arrays import FaceTree, Found, Nearness
 from lcollision_core.contact.depth import in_unit_scale
 from lcollision_core.meshes.topology import FloatArray
@@ -113,7 +112,7 @@ def distance_slopes(
     return distance, (signed.reshape(-1, 6, 1) * direction[:, None]).reshape(-1, 6, 3)
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def _apart_squared(corners, a0, a1, a2, b0, b1, b2):
     """Return the squared distance of two points, given by weights of the corners."""
     total = 0.0
@@ -311,7 +310,7 @@ def _nearer_edges(corners, best, weights):
     return best
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def _edge_weights(edge, share):
     """Return the weights of a triangle's corners at a fraction of an edge."""
     if edge == 0:

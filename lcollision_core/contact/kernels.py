@@ -15,9 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from lcollision_core.compiled import compiled, compiled_part
+from lcollision_core.compiled import compiled, compiled_part, inlined
 from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork, UncountedNodes
 
 FloatArray = npt.NDArray[np.float64]
@@ -51,7 +50,7 @@ _LEAF_CORNERS = np.uint64(3 * LEAF_SIZE)
 _LEAF_BOXES = np.uint64(6 * LEAF_SIZE)
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def _across(ux, uy, uz, vx, vy, vz):
     """Return the direction across two edges and its squared length, 0 where they are parallel."""
     dx, dy, dz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
@@ -73,7 +72,7 @@ def _across(ux, uy, uz, vx, vy, vz):
     return dx, dy, dz, length_squared
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def _along(triangles, t, k, ox, oy, oz, dx, dy, dz):
     """Return the position of corner k of triangle t along d, relative to o."""
     return (
@@ -269,14 +268,14 @@ def _refit(pose, scale, enlarged, end, tree, work):
     return True
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def _push(stack, n_waiting, a, b):
     stack[n_waiting, 0] = a
     stack[n_waiting, 1] = b
     return n_waiting + 1
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def is_uncounted(uncounted, a, b):
     """Whether two nodes share a table that says that no pair of faces below them can count."""
     level = uncounted.level[a]
@@ -287,7 +286,7 @@ def is_uncounted(uncounted, a, b):
     return (uncounted.bits[row + (column >> 3)] >> (column & 7)) & 1 != 0
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def _overlap(boxes, a, b):
     return (
         (boxes[a, 0] <= boxes[b, 3])
@@ -299,7 +298,7 @@ def _overlap(boxes, a, b):
     )
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
     """Return 1 if the boxes overlap and the faces share no vertex, else 0, without a branch."""
     n = _LEAF
@@ -406,7 +405,7 @@ def find_rules(
         rule[n] = rule_of(pairs[n, 0], pairs[n, 1], squared_depth[n], exclusions)
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def gather(corners, vertices, slot, pair, side):
     """Copy the corners of the face in a slot to one side of a pair."""
     base = slot // LEAF_SIZE * 3 * LEAF_SIZE + slot % LEAF_SIZE

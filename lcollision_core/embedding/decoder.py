@@ -13,11 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy import sparse
 
 from lcollision_core.acap.features import N_FEATURES, FeatureScaling
-from lcollision_core.compiled import compiled, compiled_part, compiled_sums
+from lcollision_core.compiled import compiled, compiled_part, compiled_sums, inlined
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
@@ -159,7 +158,7 @@ class FeatureDecoder:
         return np.array(latent, dtype=np.float32, order="C")
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def _times(a, b):  # type: ignore[no-untyped-def]
     """Multiply with separate rounding; a GPU would fuse the product with a sum."""
     return a * b
