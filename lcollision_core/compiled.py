@@ -91,7 +91,7 @@ class _Loop:
         return self._made(*args)
 
     def __getattr__(self, name: str) -> Any:
-        """Return an attribute of numba's function: numba asks for them when another loop calls this."""
+        """Return an attribute of what numba has made, which other loops that call this one need."""
         return getattr(self._made, name)
 
 

@@ -159,39 +159,6 @@ def fill_depths(triangles: FloatArray, tolerances: FloatArray, depths: FloatArra
 
 
 @compiled_part
-def _enlarge(boxes, enlarged):
-    """Enlarge boxes so that those at most `enlarged` apart overlap despite rounding."""
-    for slot in range(len(boxes) // 6):
-        base = slot // LEAF_SIZE * 6 * LEAF_SIZE + slot % LEAF_SIZE
-        for c in range(3):
-            lower, upper = boxes[base + c * LEAF_SIZE], boxes[base + (3 + c) * LEAF_SIZE]
-            # The box of an unused slot is empty.
-            if lower <= upper:
-                # Rounding a coordinate and moving it each err by 2^-24 of the numbers.
-                half = np.float32(0.5 * enlarged)
-                half += (half + max(abs(lower), abs(upper))) * _OUTWARD
-                boxes[base + c * LEAF_SIZE] = lower - half
-                boxes[base + (3 + c) * LEAF_SIZE] = upper + half
-
-
-@compiled_part
-def _sweep(boxes, corners, end, middle, scale):
-    """Enlarge boxes to hold the faces at the (V, 3) vertices `end` as well."""
-    for slot in range(len(boxes) // 6):
-        leaf, lane = slot // LEAF_SIZE, slot % LEAF_SIZE
-        for k in range(3):
-            v = corners[(leaf * 3 + k) * LEAF_SIZE + lane]
-            if v < 0:
-                break
-            base = leaf * 6 * LEAF_SIZE + lane
-            for c in range(3):
-                place = np.float32((end[v, c] - middle[c]) * scale)
-                lower, upper = base + c * LEAF_SIZE, base + (3 + c) * LEAF_SIZE
-                boxes[lower] = min(boxes[lower], place)
-                boxes[upper] = max(boxes[upper], place)
-
-
-@compiled_part
 def _place(pose, scale, work):
     """Fill in the vertices of one pose and return True, or False if beyond `MAX_DISTANCE`.
 
@@ -226,7 +193,7 @@ def _refit(pose, scale, enlarged, end, tree, work):
     if not _place(pose, scale, work):
         return False
     middle, rounded = work.middle, work.rounded
-    boxes = work.boxes
+    boxes, moves = work.boxes, len(end) > 0
     for slot in range(len(tree.slot_face)):
         leaf = slot // LEAF_SIZE
         lane = slot % LEAF_SIZE
@@ -240,12 +207,18 @@ def _refit(pose, scale, enlarged, end, tree, work):
                 boxes[base + (3 + c) * LEAF_SIZE] = -np.inf
                 continue
             p, q, r = rounded[first, c], rounded[second, c], rounded[third, c]
-            boxes[base + c * LEAF_SIZE] = min(p, min(q, r))
-            boxes[base + (3 + c) * LEAF_SIZE] = max(p, max(q, r))
-    if len(end) > 0:
-        _sweep(boxes, tree.corners, end, middle, scale)
-    if enlarged > 0.0:
-        _enlarge(boxes, enlarged)
+            lower, upper = min(p, min(q, r)), max(p, max(q, r))
+            if moves:
+                for v in (first, second, third):
+                    place = np.float32((end[v, c] - middle[c]) * scale)
+                    lower, upper = min(lower, place), max(upper, place)
+            if enlarged > 0.0:
+                # Rounding a place, and moving it, errs by 2^-24 of the numbers each.
+                half = np.float32(0.5 * enlarged)
+                half += (half + max(abs(lower), abs(upper))) * _OUTWARD
+                lower, upper = lower - half, upper + half
+            boxes[base + c * LEAF_SIZE] = lower
+            boxes[base + (3 + c) * LEAF_SIZE] = upper
 
     node_boxes = work.node_boxes
     for node in range(len(tree.left) - 1, -1, -1):
