@@ -148,8 +148,11 @@ def predictor(
     store_path: StoreArgument,
     output: OutputOption,
     preset: Annotated[
-        Literal["default", "paper"],
-        typer.Option(help="The best-measured network, or the paper's network and training."),
+        Literal["default", "large", "paper"],
+        typer.Option(
+            help="The usual network; a larger one, for millions of rows, that takes three times as "
+            "long; or the paper's network and training."
+        ),
     ] = "default",
     loss: Annotated[
         Literal["full", "no-rank", "no-depth", "entropy"],
@@ -170,10 +173,10 @@ def predictor(
     """Learn to predict collisions from labelled samples.
 
     Three tenths of the rows of the latent box are held out to measure the predictor; from 170 000
-    such rows on, a tenth of these sets the decision threshold of the preset default. You can stop
-    it at any time; the same command resumes from a checkpoint beside the output, which is removed
-    at the end. To use several devices or machines, start it with `torchrun -m app train predictor
-    ...`.
+    such rows on, a tenth of these sets the decision threshold, except with the preset paper. You
+    can stop it at any time; the same command resumes from a checkpoint beside the output, which is
+    removed at the end. To use several devices or machines, start it with `torchrun -m app train
+    predictor ...`.
     """
     from lcollision_core.bodies import LearnedBody, checkpoint_path, model_destination, save_trained
     from lcollision_core.bodies.judging import CARD_POSES

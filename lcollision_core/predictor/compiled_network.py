@@ -25,11 +25,8 @@ from lcollision_core.meshes.topology import FloatArray, length_graph
 from lcollision_core.predictor import kernels
 from lcollision_core.predictor.kernels import BLOCK, UNITS, Workspace, Workspaces, in_blocks
 
-N_POINTS = 240
-"""Points of a mesh with enough vertices; see the table in docs/experiments.md."""
 
-
-def body_points(embedding: Embedding, n_points: int = N_POINTS) -> npt.NDArray[np.int64]:
+def body_points(embedding: Embedding, n_points: int) -> npt.NDArray[np.int64]:
     """Return (P,) ascending vertices spread over the body, which depend only on the embedding.
 
     Parameters
@@ -176,7 +173,7 @@ class SkinGeometry:
 
     @classmethod
     def of(
-        cls, embedding: Embedding, sites: npt.NDArray[np.integer], n_points: int = N_POINTS
+        cls, embedding: Embedding, sites: npt.NDArray[np.integer], n_points: int
     ) -> SkinGeometry:
         """Choose the points of an embedding's body.
 

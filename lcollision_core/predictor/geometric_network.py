@@ -32,7 +32,6 @@ from lcollision_core.jobs import for_blocks
 from lcollision_core.meshes import FaceGroup
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor.compiled_network import (
-    N_POINTS,
     SQUASHED,
     CompiledSkin,
     SkinGeometry,
@@ -119,11 +118,29 @@ class ContactField(torch.nn.Module):
         return torch.stack(parts, dim=2).transpose(0, 1)
 
 
+class NetworkSizes(NamedTuple):
+    """The sizes of a network, for a mesh with enough vertices; see docs/experiments.md.
+
+    Attributes
+    ----------
+    points : P, all over the skin
+    sites : S at most, where the skin folds
+    width : of the patches' hidden layers
+    """
+
+    points: int
+    sites: int
+    width: int
+
+
+SIZES = {"default": NetworkSizes(240, 128, 32), "large": NetworkSizes(480, 256, 64)}
+"""By preset."""
+
+
 FOLD_RADIUS = 0.045
 """Normalised length along the surface, beyond the near exclusion, up to which colliding faces are a
 fold of the skin."""
 
-N_SITES = 128
 N_MEMBERS = 12
 
 _MEMBER_RADIUS = 0.03
@@ -174,6 +191,7 @@ def find_fold_sites(
     latent: npt.NDArray[np.floating],
     rules: ContactRules = STRICT,
     groups: Sequence[FaceGroup] = (),
+    n_sites: int = SIZES["default"].sites,
 ) -> npt.NDArray[np.int64]:
     """Search colliding poses for the sites where the skin folds most often.
 
@@ -182,6 +200,7 @@ def find_fold_sites(
     embedding : decodes the poses
     latent : (n, D) poses that collide; at most `_SEARCHED_POSES` are used
     rules, groups : the contact rules, and the groups that they name
+    n_sites : how many are chosen at most
 
     Returns
     -------
@@ -194,7 +213,7 @@ def find_fold_sites(
     radius = _MEMBER_RADIUS + rules.near_exclusion
     graph = skin_graph(embedding)
     members: list[npt.NDArray[np.int64]] = []
-    while len(members) < N_SITES and score.max(initial=0.0) > 0.0:
+    while len(members) < n_sites and score.max(initial=0.0) > 0.0:
         centre = int(score.argmax())
         (distance,) = skin_distances(graph, np.array([centre]))
         members.append(_spread_members(embedding, distance, radius))
@@ -364,7 +383,6 @@ def _rotations(log: torch.Tensor) -> torch.Tensor:
     )
 
 
-PATCH_WIDTH = 32
 HEAD_SIZES = (256, 64)
 
 _ROWS_AT_ONCE, _ROWS_OF_A_THREAD = 128, 32
@@ -422,8 +440,8 @@ class GeometricNetwork(PredictorNetwork):
         embedding: Embedding,
         seed: int,
         sites: npt.NDArray[np.integer],
-        n_points: int = N_POINTS,
-        width: int = PATCH_WIDTH,
+        n_points: int = SIZES["default"].points,
+        width: int = SIZES["default"].width,
     ) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
@@ -462,10 +480,13 @@ class GeometricNetwork(PredictorNetwork):
             raise LCollisionError(
                 "only the preset paper has a network without domains", "add --preset paper"
             )
+        sizes = SIZES[config.preset]
         if rows is None:
-            return cls(embedding, seed, np.empty((0, N_MEMBERS), dtype=np.int64))
-        sites = find_fold_sites(embedding, rows.latent[rows.colliding], rules, groups)
-        network = cls(embedding, seed, sites)
+            no_sites = np.empty((0, N_MEMBERS), dtype=np.int64)
+            return cls(embedding, seed, no_sites, sizes.points, sizes.width)
+        colliding = rows.latent[rows.colliding]
+        sites = find_fold_sites(embedding, colliding, rules, groups, sizes.sites)
+        network = cls(embedding, seed, sites, sizes.points, sizes.width)
         network._fit(embedding, rows.latent)
         return network
 

@@ -141,8 +141,8 @@ class PredictorRecord:
 class CollisionPredictor:
     """Predict energies per domain and collision from latent codes.
 
-    Immutable and safe to share between threads. Made by `train_predictor` or `from_section`. The
-    default preset computes in single precision on the CPU, where it needs no torch.
+    Immutable and safe to share between threads. Made by `train_predictor` or `from_section`. All
+    presets but `paper` compute in single precision on the CPU, where they need no torch.
 
     Attributes
     ----------
@@ -332,7 +332,7 @@ class CollisionPredictor:
     @cached_property
     def _compiled(self) -> CompiledNetwork | None:
         """The network for the CPU, without torch; None for the preset `paper` and on a GPU."""
-        if self.config.preset != "default" or self.device != "cpu":
+        if self.config.preset == "paper" or self.device != "cpu":
             return None
         return CompiledNetwork(self.embedding, self.arrays)
 

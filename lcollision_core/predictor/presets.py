@@ -6,4 +6,8 @@ from lcollision_core.predictor.geometric_network import GeometricNetwork
 from lcollision_core.predictor.network_base import PredictorNetwork
 from lcollision_core.predictor.paper_network import PaperNetwork
 
-NETWORKS: dict[str, type[PredictorNetwork]] = {"default": GeometricNetwork, "paper": PaperNetwork}
+NETWORKS: dict[str, type[PredictorNetwork]] = {
+    "default": GeometricNetwork,
+    "large": GeometricNetwork,
+    "paper": PaperNetwork,
+}

@@ -40,7 +40,7 @@ def require_network(arrays: Arrays, embedding: Embedding, preset: str, by_domain
     ----------
     arrays : of the model file's section
     embedding : of the latent codes
-    preset : "default" or "paper"
+    preset : of `PRESETS`
     by_domain : whether the network has a predictor for each domain
 
     Raises

@@ -29,7 +29,7 @@ from lcollision_core.predictor.geometric_network import (
     _MEMBER_RADIUS,
     FOLD_RADIUS,
     N_MEMBERS,
-    N_SITES,
+    SIZES,
     ContactField,
     GeometricNetwork,
     _Auxiliary,
@@ -217,7 +217,7 @@ def test_folds_are_looked_for_where_the_skin_folds(
     """Sites lie at colliding near pairs, and their members around them."""
     embedding = tube_model.embedding
     assert tube_folds.shape[1] == N_MEMBERS
-    assert 1 <= len(tube_folds) <= N_SITES
+    assert 1 <= len(tube_folds) <= SIZES["default"].sites
     centres = tube_folds[:, 0]
     assert len(np.unique(centres)) == len(centres)
     detector = CollisionDetector(
@@ -245,11 +245,15 @@ def test_a_body_without_folds_has_no_sites(tube_model: LearnedBody) -> None:
     assert torch.isfinite(network(torch.zeros((2, embedding.latent_size))).logit).all()
 
 
-def test_inputs_are_the_same_with_derivatives_and_without(tube_model: LearnedBody) -> None:
+@pytest.mark.parametrize("preset", SIZES)
+def test_inputs_are_the_same_with_derivatives_and_without(
+    tube_model: LearnedBody, preset: str
+) -> None:
     """Without derivatives, the CPU uses compiled loops in blocks of rows; with them, torch."""
     rows = labeller_of(tube_model).label(colliding_latent(tube_model, 70))
-    network = GeometricNetwork.build(tube_model.embedding, PRESETS["default"], rows)
+    network = GeometricNetwork.build(tube_model.embedding, PRESETS[preset], rows)
     assert isinstance(network, GeometricNetwork)
+    assert network.patch.layers[0].weight.shape[2] == SIZES[preset].width
     latent = torch.tensor(rows.latent)
     by_loops = network._inputs(latent)
     by_torch = network._inputs(latent.clone().requires_grad_())

@@ -63,7 +63,7 @@ def rows(tube_model: LearnedBody) -> LabelRows:
 @pytest.mark.parametrize(
     "preset",
     # The next test covers the default preset's real training.
-    [pytest.param(name, marks=pytest.mark.slow if name == "default" else ()) for name in PRESETS],
+    [pytest.param(name, marks=() if name == "paper" else pytest.mark.slow) for name in PRESETS],
 )
 def test_both_presets_learn_what_collides_and_how_deep(
     tube_model: LearnedBody, rows: LabelRows, preset: str
