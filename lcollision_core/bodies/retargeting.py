@@ -702,6 +702,8 @@ def skeleton_notes(body: Body, path: Path) -> tuple[str, ...]:
     motion = _read(path, most=_MOST_LOOKED_AT)[0]
     notes = motion.notes if isinstance(motion, NodeMotion) else ()
     rested = Retargeting.of(motion, rig_space_of(body, path), path).motion
+    if rested.turns_y_up:
+        return (*notes, f"{path.name} stands along y at rest and along z in its frames: z is up")
     if rested.frame is None:
         return notes
     at = f"frame {rested.frame} (from 0)"

@@ -491,6 +491,9 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
             role = role if bone is halves[role] else Role.OTHER
         elif role in (Role.PALM, Role.THUMB, Role.FINGER):
             role = role if in_hand[joint] else Role.OTHER
+        elif role is bone is Role.FOOT and "ankle" in plain_name(rig.joint_names[above]):
+            # As SMPL has it: what its foot turns about is the ball.
+            role = Role.TOE
         elif role in (Role.OTHER, Role.TOE) and parts[joint] == "Head":
             # The "ball" of a hair strand does not belong to a foot.
             role = Role.FACE

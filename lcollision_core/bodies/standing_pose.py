@@ -30,6 +30,13 @@ _MOST_SAMPLES, _MOST_FIGURES = 64, 8
 _STRAIGHT, _UPRIGHT = 0.5, 0.5
 """Least cosines: of the legs to the trunk's extension, and of the trunk to the up axis."""
 
+_ON_END, _NEARLY = 0.9, 0.2
+"""Cosine of a trunk along z; and by how much of its legs' length a skeleton's hips may be higher or
+lower in its frames than at rest."""
+
+_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""From axes with y up to those with z up."""
+
 _SHORT = 1e-9
 
 _AS_ON_AVERAGE = (Role.FOOT, Role.HAND, Role.NECK, Role.HEAD)
@@ -123,6 +130,11 @@ class RestedMotion:
         """Convert (n, J, 3, 3) rotations relative to the parents to those of the file."""
         stored: FloatArray = np.swapaxes(self._above(), 1, 2) @ turns @ self.rest_turns
         return stored
+
+    @property
+    def turns_y_up(self) -> bool:
+        """Whether the file's own rest pose has y up, and its frames z."""
+        return self.frame is None and np.array_equal(self.rest_turns[0], _TO_Z_UP)
 
     def _above(self) -> FloatArray:
         """Return the world rotation of each joint's parent at rest."""
@@ -221,6 +233,8 @@ def with_standing_rest(motion: SkeletonMotion) -> RestedMotion:
     up = np.eye(3)[2 if mean[2] > max(mean[1], _UPRIGHT) else 1]
     own_way = marks.trunk(rest)
     is_level = mean @ up < _UPRIGHT
+    if stands and own_way[1] > _UPRIGHT and _stands_on_z(marks, rest, places):
+        return RestedMotion(motion, np.broadcast_to(_TO_Z_UP, own_turns.shape), up)
     if stands and (own_way[1] > _UPRIGHT or own_way @ up > _UPRIGHT or is_level):
         return as_stored
     best = int(np.argmax([_likeness(marks, shown, up) for shown in places]))
@@ -232,6 +246,17 @@ def with_standing_rest(motion: SkeletonMotion) -> RestedMotion:
     upright = np.stack([np.cross(up, front), up, front], axis=1)
     rested = _plain_pose(motion, marks, turns, places[best], best, upright)
     return RestedMotion(motion, rested, up, front, int(samples[best]))
+
+
+def _stands_on_z(marks: _Landmarks, rest: FloatArray, places: FloatArray) -> bool:
+    """Whether a skeleton that stands along y at rest walks on the plane z = 0 in its frames.
+
+    One that lies there has no hips as high along z as its legs are long.
+    """
+    leg = float(marks.trunk(rest) @ (_middle(rest, marks.thighs) - _middle(rest, marks.feet)))
+    heights = _middle(places, marks.thighs)[:, 2] / max(leg, _SHORT)
+    trunk = marks.trunk(places)[:, 2]
+    return bool(np.median(trunk) > _ON_END and abs(np.median(heights) - 1.0) < _NEARLY)
 
 
 def _named_landmarks(motion: SkeletonMotion, rest: FloatArray) -> _Landmarks | None:

@@ -106,7 +106,7 @@ def chain(*names: str) -> str:
             "pelvis",
             "spine1 spine2 neck head",
             "left_collar left_shoulder left_elbow left_wrist left_thumb1 left_index1 left_index2",
-            "left_hip left_knee left_ankle left_toe",
+            "left_hip left_knee left_ankle left_foot",
             id="SMPL",
         ),
         pytest.param(
