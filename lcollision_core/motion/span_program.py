@@ -426,8 +426,11 @@ class SpanProgram:
 
     def _is_settled(self, now: _Looked) -> bool:
         """Whether all is free except frames for which no free pose was found."""
-        stuck = set(np.flatnonzero(~now.is_free).tolist())
-        return stuck <= self._hopeless - set(np.flatnonzero(self._is_known)) and not now.between
+        return self._are_hopeless(~now.is_free) and not now.between
+
+    def _are_hopeless(self, stuck: npt.NDArray[np.bool_]) -> bool:
+        """Whether no free pose was found for any of some frames, (n,), nor is still sought."""
+        return set(np.flatnonzero(stuck)) <= self._hopeless - set(np.flatnonzero(self._is_known))
 
     def _stuck(self, now: _Looked, reach: float | None) -> list[int]:
         """Return the colliding frames that have a known free pose within a reach.
@@ -474,11 +477,14 @@ class SpanProgram:
         reached = self.frames.pool.map(lambda at: self._reached(at, poses[at], resolves), asked)
         is_free = np.ones(n, dtype=np.bool_)
         is_free[asked] = list(reached)
+        is_whole = self._are_hopeless(~is_free)
         places = [
             (at, fraction)
             for at in range(n if self.is_cycle else n - 1)
             if is_free[at] and is_free[(at + 1) % n]
             for fraction in self.fractions[at].tolist()
+            # Frames come first: what lies between them moves with them.
+            if is_whole or (at, fraction) in self._between
         ]
         self._pulls = {}
         for at, pulls in enumerate(
