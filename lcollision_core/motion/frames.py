@@ -25,7 +25,7 @@ from lcollision_core.posing.exact import Contacts
 from lcollision_core.resolve import PoseResolver, ResolveOptions
 from lcollision_core.resolve.problem import ResolveProblem
 from lcollision_core.resolve.solvers import polish
-from lcollision_core.resolve.steps import LeastOverlap, pull_back
+from lcollision_core.resolve.steps import LeastOverlap, slide_back
 
 HalfSpacesOfPose = tuple[FloatArray, FloatArray]
 """(C, D) normals and (C,) offsets that separate the contacts of one pose."""
@@ -234,7 +234,7 @@ class Frames:
                 nearer = self.near(frame, begin)
         if nearer is None:
             return None
-        freed = pull_back(check, problem, nearer)
+        freed = slide_back(check, problem, nearer)
         return freed if self.is_near_enough(frame, freed) else None
 
     def near(self, frame: int, codes: FloatArray) -> FloatArray | None:

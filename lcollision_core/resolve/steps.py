@@ -61,11 +61,19 @@ def bisect(
 
 
 def pull_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> FloatArray:
+    """Slide a free pose back, then put each group of codes back alone if that is free.
+
+    As `slide_back`.
+    """
+    return _put_domains_back(check, problem, slide_back(check, problem, free))
+
+
+def slide_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> FloatArray:
     """Move a free pose towards Z* for as long as it stays collision-free.
 
     First move straight towards Z* by bisection. Where contact stops that, the contacts become
     linear constraints, and the nearest pose that they allow is the next goal: the pose slides along
-    them. Finally each group of codes is put back alone, if the pose then stays free.
+    them.
 
     Parameters
     ----------
@@ -84,7 +92,7 @@ def pull_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> F
     slid = _slide(check, problem, free, colliding)
     if slid is free:
         slid, _ = bisect(check, problem, free, colliding, FURTHER_HALVINGS)
-    return _put_domains_back(check, problem, slid)
+    return slid
 
 
 def fall_back(
