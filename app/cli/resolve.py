@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -52,9 +52,7 @@ from lcollision_core.tasks.words import (
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body
-    from lcollision_core.bodies.scene_body import SceneBody
-    from lcollision_core.tasks.exporting import Output
-    from lcollision_core.tasks.resolving import Remote, ResolveMotionsRequest
+    from lcollision_core.tasks.resolving import ResolveMotionsRequest, ResolvePosesRequest
 
 
 _CLOTH_METRES = 0.003
@@ -197,24 +195,15 @@ def resolve(
     either. Where joints turn, what a player shows between frames differs a little from that:
     --substeps of its poses are looked at as well.
     """
-    from lcollision_core.bodies import as_scene
     from lcollision_core.bodies.partners import following
-    from lcollision_core.tasks.exporting import (
-        files_of,
-        output_named,
-        refuse_to_replace,
-        require_one_mesh,
-        require_request,
-        source_files,
-    )
-    from lcollision_core.tasks.inputs import holds_motion, mesh_files_of, read_given
+    from lcollision_core.tasks.exporting import output_named
+    from lcollision_core.tasks.inputs import holds_motion
     from lcollision_core.tasks.resolving import (
         Remote,
         ResolveMotionsRequest,
         ResolvePosesRequest,
-        resolve_poses,
     )
-    from lcollision_core.tasks.scenes import given_of_scene, open_scene
+    from lcollision_core.tasks.scenes import open_scene
 
     if sequence:
         note("--sequence is deprecated and means --motion; use that")
@@ -236,7 +225,6 @@ def resolve(
             refuse_given(context, ("joints",), "is for motions resolved here", "leave it out")
         model = following(model, joints)
     model = model.with_options(rules).with_touching(touch or ())
-    of_bodies = as_scene(model)
     options = replace(
         options,
         locked_domains=frozenset(_domain(model, name) for name in lock or ()) | model.fixed_domains,
@@ -245,7 +233,8 @@ def resolve(
     )
     target = output_named(output, request.form, of_motions=motion)
     if motion:
-        feet = frozenset(_domain(model, name) for name in foot or ())
+        if only_check:
+            refuse_given(context, ("budget",), "is for resolving", "leave it or --only-check out")
         if for_cloth:
             choice = replace(choice, continuous=True)
             clearance = options.clearance or _cloth_clearance(model)
@@ -255,141 +244,119 @@ def resolve(
             frame=options,
             substeps=choice.substeps,
             continuous=choice.continuous,
-            feet=feet,
+            feet=frozenset(_domain(model, name) for name in foot or ()),
         )
         remote = Remote(scheduler, model_name, tuple(touch or ())) if scheduler else None
-        if of_bodies is not None:
-            request_of_scene = ResolveMotionsRequest(model, (), target, of_motion, choice, workers)
-            _resolve_scene(
-                of_bodies, request_of_scene, scene.played, in_place=in_place, as_json=as_json
-            )
-            return
-        asked = _motions_of(inputs or (), target)
-        if only_check and not asked.each:
-            raise LCollisionError(
-                "--only-check needs a folder of motions", "name one, or use check --clips"
-            )
-        wanted = asked.request(model, target, of_motion, choice, workers, remote)
-        if only_check:
-            refuse_given(context, ("budget",), "is for resolving", "leave it or --only-check out")
-            wanted = replace(wanted, only_check=True)
-        else:
-            wanted.refuse_to_replace(each=asked.each, in_place=in_place)
-        _resolve_motions(wanted, each=asked.each, as_json=as_json)
+        of_motions = ResolveMotionsRequest(
+            model, inputs or (), target, of_motion, choice, workers, remote, only_check=only_check
+        )
+        _resolve_motions(of_motions, scene.played, in_place=in_place, as_json=as_json)
         return
-    if not inputs and of_bodies is None:
-        raise LCollisionError("names no pose to resolve", "name files of poses or meshes")
     if model.is_trained:
         refuse_given(context, ("keep_feet",), "is for characters and motions", "leave it out")
     elif of_motion.keep_feet:
         options = replace(options, standing=model.up)
     request = replace(request, fps=choice.fps or request.fps)
-    if keep_detail and target.form == "poses":
+    of_poses = ResolvePosesRequest(model, (), target, options, request, keep_detail, workers)
+    _resolve_poses(of_poses, inputs or (), scale, in_place=in_place, as_json=as_json)
+
+
+def _resolve_poses(
+    request: ResolvePosesRequest,
+    inputs: Sequence[Path],
+    scale: float,
+    *,
+    in_place: bool,
+    as_json: bool,
+) -> None:
+    """Resolve the poses and meshes of files, print the results and exit with their status."""
+    from lcollision_core.bodies import as_scene
+    from lcollision_core.tasks.exporting import (
+        files_of,
+        refuse_to_replace,
+        require_one_mesh,
+        require_request,
+        source_files,
+    )
+    from lcollision_core.tasks.inputs import mesh_files_of, read_given
+    from lcollision_core.tasks.resolving import resolve_poses
+    from lcollision_core.tasks.scenes import given_of_scene
+
+    body, output, export = request.body, request.output, request.export
+    scene = as_scene(body)
+    if not inputs and scene is None:
+        raise LCollisionError("names no pose to resolve", "name files of poses or meshes")
+    if request.keep_detail and output.form == "poses":
         raise LCollisionError(
             "would contain codes; --keep-detail applies only to meshes",
             "name a mesh or a folder, or leave out --keep-detail",
-            where=output,
+            where=output.path,
         )
-    files, failed = mesh_files_of(inputs or ()), False
-    if len(files) > 1 and of_bodies is None:
-        require_one_mesh(target, len(files))
+    files, failed = mesh_files_of(inputs), False
+    if len(files) > 1 and scene is None:
+        require_one_mesh(output, len(files))
     with progress_bar("Reading poses") as job:
-        if of_bodies is not None:
-            given = given_of_scene(of_bodies, files, scale, job)
+        if scene is not None:
+            given = given_of_scene(scene, files, scale, job)
         else:
-            given, failed = read_given(model, files, scale, job)
+            given, failed = read_given(body, files, scale, job)
     if not given:
         raise typer.Exit(ExitStatus.BAD_INPUT)
-    require_one_mesh(target, len(given))
+    require_one_mesh(output, len(given))
     poses = [given_pose.pose for given_pose in given]
-    require_request(target, model, poses, request)
-    read = [*files, *source_files(model, request)]
-    refuse_to_replace(files_of(target, model, poses, request), read, in_place=in_place)
-    asked_poses = ResolvePosesRequest(model, given, target, options, request, keep_detail, workers)
+    require_request(output, body, poses, export)
+    read = [*files, *source_files(body, export)]
+    refuse_to_replace(files_of(output, body, poses, export), read, in_place=in_place)
     with cancel_on_interrupt() as job, progress_bar("Resolving poses", job) as job:
-        resolved = resolve_poses(asked_poses, job)
+        resolved = resolve_poses(replace(request, given=given), job)
     for resolved_pose in resolved:
         if resolved_pose.result.note:
             note(f"{resolved_pose.given.source}: {resolved_pose.result.note}")
         if not as_json:
-            fit = (
-                None
-                if resolved_pose.given.mesh is None
-                else resolved_pose.given.pose.fit_error_mean or 0.0
-            )
             text = resolved_pose_text(
                 resolved_pose.result,
-                options.clearance,
+                request.options.clearance,
                 has_detail=resolved_pose.has_detail,
-                fit=fit,
+                fit=resolved_pose.fit,
             )
             tell(f"{resolved_pose.given.source}: {text}")
     if as_json:
         by_rules = {
-            "near_exclusion": model.rules.near_exclusion,
-            "excluded_at_rest": excluded_at_rest(model),
+            "near_exclusion": body.rules.near_exclusion,
+            "excluded_at_rest": excluded_at_rest(body),
         }
         print_json([resolved_pose.to_json() | by_rules for resolved_pose in resolved])
     else:
-        note_rules(model)
+        note_rules(body)
     if failed:
         raise typer.Exit(ExitStatus.BAD_INPUT)
-    results = [resolved_pose.result for resolved_pose in resolved]
-    ends = (r.predicted_free if r.exactly_free is None else r.exactly_free for r in results)
-    if not all(ends) or not all(resolved_pose.stays_free for resolved_pose in resolved):
+    if not all(resolved_pose.is_free for resolved_pose in resolved):
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
-@dataclass(frozen=True)
-class _Motions:
-    """The motion files given to a command.
+def _resolve_motions(
+    request: ResolveMotionsRequest, played: Sequence[str], *, in_place: bool, as_json: bool
+) -> None:
+    """Resolve motions into one output, or each to a file of a folder; exit with their status.
 
-    Attributes
+    Parameters
     ----------
-    files : empty for the clips of the character itself
-    folder : the folder given instead of files; None if there is none
-    each : whether each file gets an output of its own
+    played : what the bodies of a scene do: see `SceneOptions`
     """
-
-    files: Sequence[Path]
-    folder: Path | None
-    each: bool
-
-    def request(
-        self,
-        model: Body,
-        target: Output,
-        options: MotionOptions,
-        choice: MotionChoice,
-        workers: int | None,
-        remote: Remote | None,
-    ) -> ResolveMotionsRequest:
-        """Return the request to resolve them."""
-        from lcollision_core.tasks.resolving import ResolveMotionsRequest
-
-        if remote is not None and not self.each:
-            raise LCollisionError("--scheduler needs a folder of motions", "name one")
-        return ResolveMotionsRequest(
-            model, self.files, target, options, choice, workers, remote, self.folder
-        )
-
-
-def _motions_of(inputs: Sequence[Path], target: Output) -> _Motions:
-    """Find the motion files; several files with a folder as output count as a folder."""
-    from lcollision_core.tasks.inputs import motion_files
-
-    if len(inputs) == 1 and inputs[0].is_dir():
-        files = motion_files(inputs[0], Job(note=note), besides=target.path)
-        if files and target.form != "folder":
-            what = f"cannot contain {counted(len(files), 'motion')}"
-            raise LCollisionError(what, "name a folder", where=target.path)
-        return _Motions(files or inputs, inputs[0] if files else None, bool(files))
-    return _Motions(inputs, None, len(inputs) > 1 and target.form == "folder")
-
-
-def _resolve_motions(request: ResolveMotionsRequest, *, each: bool, as_json: bool) -> None:
-    """Resolve motions into one output, or `each` into a folder; exit with the status of that."""
+    from lcollision_core.bodies import as_scene
     from lcollision_core.tasks.resolving import FolderStatus, Row, resolve_folder, resolve_motions
+    from lcollision_core.tasks.scenes import resolve_scene_motion
+
+    scene = as_scene(request.body)
+    request, each = (request, False) if scene is not None else _with_motions_of_folder(request)
+    if request.only_check and not each:
+        raise LCollisionError(
+            "--only-check needs a folder of motions", "name one, or use check --clips"
+        )
+    if request.remote is not None and not each:
+        raise LCollisionError("--scheduler needs a folder of motions", "name one")
+    if scene is None and not request.only_check:
+        request.refuse_to_replace(each=each, in_place=in_place)
 
     def tell_rows(rows: Sequence[Row]) -> None:
         for row in rows:
@@ -410,7 +377,10 @@ def _resolve_motions(request: ResolveMotionsRequest, *, each: bool, as_json: boo
                 rows = resolve_folder(request, job)
         else:
             with progress_bar(task, job) as job:
-                rows += resolve_motions(request, job)
+                if scene is None:
+                    rows += resolve_motions(request, job)
+                else:
+                    rows += [resolve_scene_motion(scene, request, played, job, in_place=in_place)]
             tell_rows(() if as_json else rows)
     if as_json:
         print_json([row.to_json() for row in rows])
@@ -420,25 +390,26 @@ def _resolve_motions(request: ResolveMotionsRequest, *, each: bool, as_json: boo
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
-def _resolve_scene(
-    body: SceneBody,
-    request: ResolveMotionsRequest,
-    played: Sequence[str],
-    *,
-    in_place: bool,
-    as_json: bool,
-) -> None:
-    """Resolve the motion of a scene; exit with the status of that."""
-    from lcollision_core.tasks.scenes import resolve_scene_motion
+def _with_motions_of_folder(request: ResolveMotionsRequest) -> tuple[ResolveMotionsRequest, bool]:
+    """Find the motion files of a folder; several files count as a folder too.
 
-    with cancel_on_interrupt() as job, progress_bar("Resolving motions", job) as job:
-        row = resolve_scene_motion(body, request, played, job, in_place=in_place)
-    if as_json:
-        print_json([row.to_json()])
-    else:
-        tell(resolved_clip_text(row))
-    if not row.is_free:
-        raise typer.Exit(ExitStatus.ANSWER_IS_NO)
+    Returns
+    -------
+    request : with the files, and the folder where one is named
+    each : whether each file comes to one of its own
+    """
+    from lcollision_core.tasks.inputs import motion_files
+
+    inputs, output = request.files, request.output
+    if len(inputs) != 1 or not inputs[0].is_dir():
+        return request, len(inputs) > 1 and output.form == "folder"
+    files = motion_files(inputs[0], Job(note=note), besides=output.path)
+    if not files:
+        return request, False
+    if output.form != "folder":
+        what = f"cannot contain {counted(len(files), 'motion')}"
+        raise LCollisionError(what, "name a folder", where=output.path)
+    return replace(request, files=files, root=inputs[0]), True
 
 
 def _domain(model: Body, name: str) -> int:

@@ -98,6 +98,18 @@ class ResolvedPose:
     has_detail: bool
     stays_free: bool
 
+    @property
+    def is_free(self) -> bool:
+        """Whether the pose ends free, by the prediction where it was not checked."""
+        result = self.result
+        ends_free = result.predicted_free if result.exactly_free is None else result.exactly_free
+        return bool(ends_free) and self.stays_free
+
+    @property
+    def fit(self) -> float | None:
+        """Mean error of the encoding, normalised; None for a pose of codes."""
+        return None if self.given.mesh is None else self.given.pose.fit_error_mean or 0.0
+
     def to_json(self) -> dict[str, Any]:
         """Return the values for a report."""
         row = {"source": self.given.source, "output": str(self.file), **_facts(self.result)}
