@@ -83,9 +83,9 @@ class LCollisionError(Exception):
     @property
     def headline(self) -> str:
         """The sentence without the next step."""
-        said = f"{self.where} {self.what or f'must be {self.expected}'}".lstrip()
-        said += f", expected {self.expected}" if self.what and self.expected else ""
-        return f"{said}, got {self.got}" if self.got else said
+        sentence = f"{self.where} {self.what or f'must be {self.expected}'}".lstrip()
+        sentence += f", expected {self.expected}" if self.what and self.expected else ""
+        return f"{sentence}, got {self.got}" if self.got else sentence
 
     def __str__(self) -> str:
         return f"{self.headline}; {self.next_step}" if self.next_step else self.headline

@@ -49,9 +49,13 @@ def device_function(
         for name in source.__code__.co_names
         if name not in instead and hasattr(value := source.__globals__.get(name), "py_func")
     }
-    own = FunctionType(source.__code__, {**source.__globals__, **called}, source.__name__)
-    made: Callable[..., Any] = own if SIMULATED else cuda.jit(device=True)(own)
-    return made
+    plain_function = FunctionType(
+        source.__code__, {**source.__globals__, **called}, source.__name__
+    )
+    compiled_function: Callable[..., Any] = (
+        plain_function if SIMULATED else cuda.jit(device=True)(plain_function)
+    )
+    return compiled_function
 
 
 def _rounded_product(a: Any, b: Any) -> Any:
@@ -103,10 +107,10 @@ class Buffers:
 
     def zeros(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> DeviceArray:
         """Return an array of zeros that reuses the buffer of this name."""
-        taken = self.take(name, shape, dtype)
-        if taken.size > 0:
-            _clear[blocks_for(taken.size), THREADS](taken.reshape(taken.size))
-        return taken
+        buffer = self.take(name, shape, dtype)
+        if buffer.size > 0:
+            _clear[blocks_for(buffer.size), THREADS](buffer.reshape(buffer.size))
+        return buffer
 
 
 @cuda.jit

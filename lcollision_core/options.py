@@ -82,9 +82,9 @@ def require_limits(values: Any) -> None:
     for name, (_, limits) in limits_of(cls).items():
         value = getattr(values, name)
         if value is not None and (expected := _not_met(value, limits)):
-            said = f"the {name.replace('_', ' ')}" if isinstance(limits, Option) else name
+            field_name = f"the {name.replace('_', ' ')}" if isinstance(limits, Option) else name
             got = f"{value:g}" if isinstance(value, float) else value
-            raise LCollisionError.must_be(said, expected, got)
+            raise LCollisionError.must_be(field_name, expected, got)
 
 
 def _not_met(value: Any, limits: Limits) -> str:
@@ -216,17 +216,17 @@ class RuleOptions:
             next_step = "leave the option out, or learn the model again from a rigged character"
             raise LCollisionError(what, next_step, where=where)
         values = {field.name: getattr(self, field.name) for field in fields(RuleOptions)}
-        chosen: dict[str, Any] = {name: to for name, to in values.items() if to is not None}
+        changes: dict[str, Any] = {name: to for name, to in values.items() if to is not None}
         if self.near_exclusion is not None:
-            chosen["near_by_limb"] = False
+            changes["near_by_limb"] = False
         pairs = (named_pair(entry, names) for entry in self.ignored or ())
         left_out = (named_group(entry, names) for entry in self.left_out)
-        chosen["ignored"] = tuple(dict.fromkeys((*rules.ignored, *pairs)))
-        chosen["left_out"] = tuple(dict.fromkeys((*rules.left_out, *left_out)))
+        changes["ignored"] = tuple(dict.fromkeys((*rules.ignored, *pairs)))
+        changes["left_out"] = tuple(dict.fromkeys((*rules.left_out, *left_out)))
         tolerated = (_tolerated_pair(entry, names) for entry in self.tolerated_pairs)
         by_pair = {frozenset(pair[:2]): pair for pair in (*rules.tolerated_pairs, *tolerated)}
-        chosen["tolerated_pairs"] = tuple(by_pair.values())
-        return replace(rules, **chosen)
+        changes["tolerated_pairs"] = tuple(by_pair.values())
+        return replace(rules, **changes)
 
     def applied(
         self,

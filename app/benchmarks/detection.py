@@ -62,8 +62,8 @@ def time_detection(poses: PoseSet, n_poses: int, threads: int, job: Job = UNWATC
     threads : of our second row; 1 for no such row
     job : reports poses
     """
-    chosen = np.unique(np.linspace(0, len(poses) - 1, min(n_poses, len(poses))).astype(int))
-    vertices = poses.vertices[chosen].astype(np.float64)
+    pose_numbers = np.unique(np.linspace(0, len(poses) - 1, min(n_poses, len(poses))).astype(int))
+    vertices = poses.vertices[pose_numbers].astype(np.float64)
     detector = CollisionDetector(poses.topology, vertices[0])
     expected = [set(map(tuple, detector.detect(pose).pairs.tolist())) for pose in vertices]
     # By tool, threads and mode: seconds per pose, and whether the answer was right.

@@ -45,10 +45,12 @@ def time_gpu(body: Body, n_poses: int, job: Job = UNWATCHED) -> list[Row]:
 def blended_poses(poses: PoseSet, n_poses: int) -> Vertices:
     """Return the first poses of a set, filled up to `n_poses` by blends of random pairs."""
     generator = np.random.default_rng(0)
-    own = poses.vertices[:n_poses].astype(np.float32)
-    first, second = generator.integers(len(own), size=(2, n_poses - len(own)))
-    share = generator.random((n_poses - len(own), 1, 1), dtype=np.float32)
-    return np.concatenate([own, own[first] + share * (own[second] - own[first])])
+    given_poses = poses.vertices[:n_poses].astype(np.float32)
+    first, second = generator.integers(len(given_poses), size=(2, n_poses - len(given_poses)))
+    share = generator.random((n_poses - len(given_poses), 1, 1), dtype=np.float32)
+    return np.concatenate(
+        [given_poses, given_poses[first] + share * (given_poses[second] - given_poses[first])]
+    )
 
 
 def time_checks(detector: CollisionDetector, vertices: Vertices, job: Job = UNWATCHED) -> list[Row]:

@@ -108,16 +108,17 @@ def _measured(body: Body, before: Motion, after: Motion) -> dict[str, Any]:
     screened = [screen_motion(motion, check, 0) for motion in (before, after)]
     free_before, free = (len(before) - len(frame.colliding) for frame in screened)
     colliding = {frame.frame for frame in screened[1].colliding}
-    chosen = [int(n) for n in evenly_spaced(len(after), _CONFIRMED) if int(n) not in colliding]
+    free_frames = [int(n) for n in evenly_spaced(len(after), _CONFIRMED) if int(n) not in colliding]
     confirmed = [
-        is_free_by_brute_force(body, after.vertices(n, check).astype(np.float32)) for n in chosen
+        is_free_by_brute_force(body, after.vertices(n, check).astype(np.float32))
+        for n in free_frames
     ]
     standing = standing_parts(before, check, np.eye(3)[body.up_axis])
     report = MotionReport.of(before, after, check, standing)
     return {
         "free_before": free_before,
         "free_after": free,
-        "confirmed": f"{sum(confirmed)} of {len(chosen)}",
+        "confirmed": f"{sum(confirmed)} of {len(free_frames)}",
         "half_steps": len(screen_motion(after, check, 1).in_between),
         "seventh_steps": len(screen_motion(after, check, 7).in_between),
         "mean_change": report.mean_change,

@@ -142,13 +142,13 @@ def real_poses(
     """
     model.require_topology(pose_set.topology, "the pose set")
     colliding = model.detector.are_colliding(pose_set.vertices.astype(np.float32))
-    chosen = np.flatnonzero(colliding)[:n_poses]
-    if len(chosen) == 0:
+    pose_numbers = np.flatnonzero(colliding)[:n_poses]
+    if len(pose_numbers) == 0:
         raise LCollisionError("no pose of the set intersects itself", "name another set")
     encoded = []
-    for pose in chosen:
+    for pose in pose_numbers:
         encoded.append(model.encode(pose_set.vertices[pose]))
-        job.report(len(encoded), len(chosen))
+        job.report(len(encoded), len(pose_numbers))
     return CollidingPoses(
         np.stack([pose.latent for pose in encoded]), [pose.placement for pose in encoded]
     )
@@ -248,11 +248,11 @@ def score_solver(
         "vertex_distance": float(np.mean([result.vertex_distance_mean for result in whole])),
         **_how_they_end(model, whole, options.clearance),
     }
-    shown = called if called.any() else ~called
+    counted_poses = called if called.any() else ~called
     runs = SolverRuns(
         solver=str(options.solver),
-        iterations=np.array([result.iterations for result in alone])[shown],
-        seconds=np.array([result.seconds for result in alone])[shown],
+        iterations=np.array([result.iterations for result in alone])[counted_poses],
+        seconds=np.array([result.seconds for result in alone])[counted_poses],
         energy_change=change,
     )
     return score, runs

@@ -152,7 +152,9 @@ def resolve(
     from lcollision_core.files import read_pose_set
     from lcollision_core.resolve import ResolveOptions, Solver
 
-    chosen = [Solver(ResolveOptions(solver=name).solver) for name in solvers or list(Solver)]
+    compared_solvers = [
+        Solver(ResolveOptions(solver=name).solver) for name in solvers or list(Solver)
+    ]
     options = ResolveOptions(metric=metric, clearance=clearance, largest_change=soft)
     if figure is not None:
         _require_folder(figure)
@@ -173,7 +175,7 @@ def resolve(
             with progress_bar("Resolving", job) as bar:
                 rows.append(score_steps(model, poses, options, bar))
         else:
-            for solver in chosen:
+            for solver in compared_solvers:
                 with progress_bar(f"Resolving with {solver}", job) as bar:
                     chosen_one = replace(options, solver=solver)
                     score, run = score_solver(model, poses, chosen_one, bar)

@@ -69,9 +69,9 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
             collisions = detector.detect_batch(poses.vertices, job=job)
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
-    asked = poses.vertices[:: -(-len(poses) // _MOST_POSES_ASKED)]
+    sampled_poses = poses.vertices[:: -(-len(poses) // _MOST_POSES_ASKED)]
     kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
-    found_by_kind = propose_by_kind(detector, asked, kinds)
+    found_by_kind = propose_by_kind(detector, sampled_poses, kinds)
     proposed = [pair for kind in found_by_kind.values() for pair in kind]
     guess = poses.up
     report: dict[str, Any] = {
@@ -117,8 +117,8 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
 
 def _print_proposed(proposed: Sequence[ProposedPair], rules: ContactRules) -> None:
     """List groups that are nearly always in contact, and the option that ignores them."""
-    known = {frozenset(pair) for pair in rules.ignored}
-    new = [pair for pair in proposed if frozenset(pair.groups) not in known]
+    ignored_pairs = {frozenset(pair) for pair in rules.ignored}
+    new = [pair for pair in proposed if frozenset(pair.groups) not in ignored_pairs]
     for pair in new[:_LISTED]:
         first, second = pair.groups
         tell(
@@ -268,10 +268,8 @@ def _gathered(
     for remark in poses.notes:
         note(remark)
     if by_rig is not None:
-        made = poses.provenance["sources"][-1]["by_rig"]
-        note(
-            f"{made['free']} of {counted(made['drawn'], 'pose')} by the rig are free of collisions"
-        )
+        drawn = poses.provenance["sources"][-1]["by_rig"]
+        note(f"{drawn['free']} of {counted(drawn['drawn'], 'pose')} by the rig are free")
     if not (guess := poses.up).is_sure:
         note(f"{up_sentence(guess)}; --up x|y|z overrides it")
     return poses

@@ -92,8 +92,8 @@ def label(
     if count is None:
         _check(model, output, as_json)
         return
-    chosen = draws or LabelStore.draws_of(output, Draws.BOX)
-    labeller = model.labeller(chosen)
+    wanted_draws = draws or LabelStore.draws_of(output, Draws.BOX)
+    labeller = model.labeller(wanted_draws)
     started = time.monotonic()
     try:
         with cancel_on_interrupt() as job, status_bar(_TASK, told_of, job, rows=True) as job:
@@ -108,15 +108,15 @@ def label(
             )
     except CancelledError:
         with suppress(LabelStoreError):
-            kept = counted(LabelStore.open(output).n_rows, "row")
-            note(f"stopped; {output} has {kept}; run the same command again to continue")
+            rows_text = counted(LabelStore.open(output).n_rows, "row")
+            note(f"stopped; {output} has {rows_text}; run the same command again to continue")
         raise
     seconds = time.monotonic() - started
     report: dict[str, Any] = {
         "store": str(output),
         **measured_model(model),
         "seed": seed,
-        "draws": chosen.value,
+        "draws": wanted_draws.value,
         "rows": status.done,
         "labelled": status.labelled,
         "colliding_share": status.colliding_share,

@@ -176,12 +176,12 @@ def domains(
             )
         renamings[int(number) - 1] = name
     body = open_body(model_name)
-    chosen: dict[str, str | None] = {}
+    role_of_joint: dict[str, str | None] = {}
     for request in roles or []:
         joint, _, role = request.rpartition("=")
-        chosen[joint] = None if role == "auto" else role
-    if chosen:
-        set_joint_roles(body, chosen)
+        role_of_joint[joint] = None if role == "auto" else role
+    if role_of_joint:
+        set_joint_roles(body, role_of_joint)
         body = open_body(model_name)
     if renamings:
         body = change_body(body, model_name, lambda kept: kept.edit_domains(renamings))
@@ -189,8 +189,10 @@ def domains(
     if body.joints is not None:
         tell("Joints:")
         space = body.joints
-        for joint, own, side in zip(space.rig.joint_names, space.roles, space.sides, strict=True):
-            tell(f"  {joint}: {role_name(own, side)}")
+        for joint, joint_role, side in zip(
+            space.rig.joint_names, space.roles, space.sides, strict=True
+        ):
+            tell(f"  {joint}: {role_name(joint_role, side)}")
     for remark in body.notes:
         note(remark)
 

@@ -36,22 +36,22 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
             parameters.append(parameter.replace(annotation=hint, kind=_BY_NAME))
             continue
         left_out = next((extra for extra in extras if isinstance(extra, Without)), Without())
-        known = _options_of(kind)
-        offered = [f for f in fields(kind) if f.name in known and f.name not in left_out]
+        options_of_field = _options_of(kind)
+        offered = [f for f in fields(kind) if f.name in options_of_field and f.name not in left_out]
         offered.sort(key=lambda field: bool(field.kw_only))
         groups[parameter.name] = kind, offered
-        parameters += [_parameter(field, *known[field.name]) for field in offered]
+        parameters += [_parameter(field, *options_of_field[field.name]) for field in offered]
     parameters.sort(key=lambda parameter: parameter.default is not inspect.Parameter.empty)
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
         for name, (kind, offered) in groups.items():
-            known = _options_of(kind)
-            taken = {field.name: values.pop(field.name, None) for field in offered}
+            options_of_field = _options_of(kind)
+            field_values = {field.name: values.pop(field.name, None) for field in offered}
             values[name] = kind(
                 **{
-                    field: _read(value, *known[field])
-                    for field, value in taken.items()
+                    field: _read(value, *options_of_field[field])
+                    for field, value in field_values.items()
                     if value is not None
                 }
             )

@@ -65,15 +65,15 @@ def print_figure(
         given, _ = read_given(model, [pose], scale, job.part())
         if not given:
             raise typer.Exit(ExitStatus.BAD_INPUT)
-        chosen = [given_pose.pose for given_pose in given if name in (None, given_pose.pose.name)]
-        if len(chosen) != 1:
+        matching = [given_pose.pose for given_pose in given if name in (None, given_pose.pose.name)]
+        if len(matching) != 1:
             names = ", ".join(given_pose.pose.name for given_pose in given[:8])
             raise LCollisionError(
-                f"has {counted(len(chosen), 'pose')} {f'named {name!r}' if name else ''}".rstrip(),
+                f"has {counted(len(matching), 'pose')}{f' named {name!r}' if name else ''}",
                 f"name one by --pose: {names}{' ...' if len(given) > 8 else ''}",
                 where=pose,
             )
-        figure = print_pose(model, chosen[0], output, options, job)
+        figure = print_pose(model, matching[0], output, options, job)
     if as_json:
         print_json(figure.to_json())
     else:

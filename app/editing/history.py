@@ -71,8 +71,8 @@ class Moment:
     @property
     def space(self) -> OwnSpace | None:
         """The body's space in this frame; None if it is the same in all frames."""
-        own = self.motion.space_at
-        return None if own is None else partial(own, self.frame)
+        frame_space = self.motion.space_at
+        return None if frame_space is None else partial(frame_space, self.frame)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +103,8 @@ class DocumentState:
 
     def drawn(self, model: Body) -> npt.NDArray[np.float32]:
         """Return the (V, 3) vertices as drawn, in the data's unit: see `ExactCheck`."""
-        own = None if self.moment is None else self.moment.space
-        check = model.exact_check(self.pose.placement, own and own())
+        frame_space = None if self.moment is None else self.moment.space
+        check = model.exact_check(self.pose.placement, frame_space and frame_space())
         return check.drawn(check.decode(self.pose.latent)[0])
 
     def same_as(self, other: DocumentState) -> bool:
@@ -385,7 +385,7 @@ class PoseHistory(QObject):
         library = () if self.store is None else self.store.poses
         source = Source.TRAINING
         for candidate, poses in ((Source.LIBRARY, library), (Source.FILE, self.file_poses)):
-            if any(pose is own for own in poses):
+            if any(pose is stored_pose for stored_pose in poses):
                 source = candidate
         self.load(f"Load {pose.name}", pose, source)
 

@@ -117,8 +117,10 @@ class Library(QObject):
         -------
         added : how many were new
         """
-        known = {pose.name: pose for pose in self.poses}
-        added = [p for p in poses if p.name not in known or not known[p.name].same_as(p)]
+        pose_by_name = {pose.name: pose for pose in self.poses}
+        added = [
+            p for p in poses if p.name not in pose_by_name or not pose_by_name[p.name].same_as(p)
+        ]
         names = self._free_names([pose.name for pose in added])
         what = added[0].name if len(added) == 1 else counted(len(added), "pose")
         new = [replace(p, name=name, moves=None) for p, name in zip(added, names, strict=True)]
@@ -189,9 +191,9 @@ class Library(QObject):
         if why_no_name(name):
             what = f"a name has at most {MAX_POSE_NAME_LENGTH} characters"
             return ModelFileError(what, "choose a shorter one")
-        taken = self.name_taken_by(name)
-        if taken and taken != old:
-            what = f"your library already has a pose “{taken}”"
+        holder = self.name_taken_by(name)
+        if holder and holder != old:
+            what = f"your library already has a pose “{holder}”"
             return ModelFileError(what, "choose another name")
         return None
 
@@ -301,13 +303,13 @@ class Library(QObject):
         if not changes:
             return
         poses = list(self.poses)
-        made = []
+        applied = []
         for old, new in changes:
             index = next((at for at, pose in enumerate(poses) if pose is old), len(poses))
-            made.append(LibraryChange(old, new, index))
+            applied.append(LibraryChange(old, new, index))
             poses[index : index + 1] = [] if new is None else [new]
         history = self._history
-        step = LibraryStep(label, self, history, state or history.state, made)
+        step = LibraryStep(label, self, history, state or history.state, applied)
         history.undo_stack.push(step)
 
 

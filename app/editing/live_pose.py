@@ -802,8 +802,8 @@ class Pins(QObject):
             grip.vertex: Pin.of(grip, vertices, frame_round(space, grip.vertex) if oriented else ())
             for grip in grips
         }
-        kept = [pin for pin in self._pins if pin.vertex not in added]
-        pins = (*kept, *added.values())
+        other_pins = [pin for pin in self._pins if pin.vertex not in added]
+        pins = (*other_pins, *added.values())
         if len(pins) > MAX_PINS:
             self.message.emit(f"A pose has at most {counted(MAX_PINS, 'pin')}")
             return

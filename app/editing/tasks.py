@@ -431,15 +431,15 @@ class Tasks(QObject):
         target = Path(path) if path is not None else history.file
         if target is None:
             raise ModelFileError("the pose has no file yet", "save it under a name")
-        asked, opened = history.pose, history.opened
+        asked_pose, opened = history.pose, history.opened
 
         def done(stamp: FileStamp | None) -> str:
             if history.opened is opened:
                 history.file_stamp = stamp
-                history.keep_saved(asked, pose, target)
+                history.keep_saved(asked_pose, pose, target)
             return f"Saved {target.name}"
 
-        pose = named_after(asked, target)
+        pose = named_after(asked_pose, target)
         job = unwatched(save_poses, target, self._model, history.file_poses, pose)
         self.save_file(target, job, done)
 
@@ -507,13 +507,15 @@ class Tasks(QObject):
         ModelFileError : the model has no predictor.
         """
         model, history = self._model, self._history
-        chosen = self.resolve_options(options)
+        resolve_options = self.resolve_options(options)
         history.close_gesture()
         self.cancel_resolve()
         moment = history.state.moment
-        own = None if moment is None else moment.space
+        frame_space = None if moment is None else moment.space
         placement = history.pose.placement
-        job = partial(resolve_pose, model, history.latent, placement, chosen, own=own)
+        job = partial(
+            resolve_pose, model, history.latent, placement, resolve_options, own=frame_space
+        )
         self._solve_began = time.monotonic()
         self.start(Work.RESOLVE, "Resolving", job, self._on_resolved, self._on_unresolved)
         self.solve_started.emit()
@@ -632,12 +634,12 @@ class Tasks(QObject):
         if image.resolution is not None:
             after = replace(after, outcome_seconds=image.resolution.seconds)
         history.push("Mirror", after)
-        said = [heading(mirrored_text(image))]
+        sentences = [heading(mirrored_text(image))]
         if image.lost_freedom and image.resolution is not None and image.resolution.note:
-            said.append(image.resolution.note)
+            sentences.append(image.resolution.note)
         if self._motion.locked_domains and not image.restored:
-            said.append("locked parts were mirrored too")
-        self.message.emit("; ".join(said))
+            sentences.append("locked parts were mirrored too")
+        self.message.emit("; ".join(sentences))
 
     def _on_poses_mirrored(self, images: list[tuple[NamedPose, MirroredPose]]) -> None:
         from lcollision_core.bodies import MAX_POSE_NAME_LENGTH
@@ -650,19 +652,19 @@ class Tasks(QObject):
         if not added:
             self.message.emit("These mirrored poses are already in your library")
             return
-        said = [f"Added {counted(added, 'mirrored pose')} to your library"]
+        sentences = [f"Added {counted(added, 'mirrored pose')} to your library"]
         if len(images) == 1:
-            said.append(mirrored_text(images[0][1]))
+            sentences.append(mirrored_text(images[0][1]))
         else:
             worst = max(image.fit_error_max for _, image in images)
-            said.append(f"off by at most {height_text(worst)} of the body size")
+            sentences.append(f"off by at most {height_text(worst)} of the body size")
             for count, words in (
                 (sum(i.pairs_after == 0 < i.pairs_mirrored for _, i in images), "resolved"),
                 (sum(i.lost_freedom for _, i in images), "colliding, though free before"),
             ):
                 if count:
-                    said.append(f"{count} {words}")
-        self.message.emit("; ".join(said))
+                    sentences.append(f"{count} {words}")
+        self.message.emit("; ".join(sentences))
 
     def _on_resolved(self, found: tuple[ResolveResult, npt.NDArray[np.float32]]) -> None:
         result, ghost = found

@@ -249,10 +249,10 @@ class MotionResolve(QObject):
         n_left = int((~found.after).sum())
         text = f"{counted(int((~found.before).sum()), 'frame')} collided; "
         text += f"{n_left} still do" if n_left else "all are free now"
-        kept = (span.sentence(part_names) for span in found.kept)
+        kept_sentences = (span.sentence(part_names) for span in found.kept)
         ground = ground_text(None if found.ground is None else asdict(found.ground))
-        said = ["Stopped: " * self.is_ending + text, *kept, ground]
-        return "; ".join(filter(None, said))
+        sentences = ["Stopped: " * self.is_ending + text, *kept_sentences, ground]
+        return "; ".join(filter(None, sentences))
 
     @Slot(int, int)
     def _on_progress(self, done: int, total: int) -> None:
@@ -519,8 +519,10 @@ class Timeline(QObject):
         """Go to the next (1) or previous (-1) colliding frame, wrapping at the ends."""
         deep = np.flatnonzero(np.nan_to_num(self.checks.deepest) > 0.0)
         if len(deep) == 0:
-            known = self.checks.n_checked == len(self.checks.deepest)
-            self.message.emit("No frame collides" if known else "No colliding frame is known yet")
+            all_checked = self.checks.n_checked == len(self.checks.deepest)
+            self.message.emit(
+                "No frame collides" if all_checked else "No colliding frame is known yet"
+            )
             return
         at = -1 if self.frame is None else self.frame
         beyond = deep[deep > at] if direction > 0 else deep[deep < at][::-1]
@@ -589,10 +591,10 @@ class Timeline(QObject):
         self._cache.predicts = self._pose.predicts
         numbers = [frame, *self.onion.frames(frame, len(motion))]
         numbers += [self._wrapped(frame + by) for by in range(1, ahead + 1)]
-        wanted = [(motion, number) for number in dict.fromkeys(numbers)]
+        requests = [(motion, number) for number in dict.fromkeys(numbers)]
         if self._has_ghost(motion, frame) and self.original is not None:
-            wanted.insert(1, (self.original, frame))
-        self._cache.want(wanted)
+            requests.insert(1, (self.original, frame))
+        self._cache.want(requests)
 
     def _wrapped(self, frame: int) -> int:
         if frame <= self.last:
@@ -908,10 +910,10 @@ class Timeline(QObject):
         history, model = self._history, self._history.model
         if self.motion is None:
             raise LCollisionError("there is no motion to resolve", "open one first")
-        chosen = options or MotionOptions()
+        motion_options = options or MotionOptions()
         # A motion keeps its feet by itself, part by part and for as long as they stand.
-        of_frames = replace(self._tasks.resolve_options(chosen.frame), standing=None)
-        chosen = replace(chosen, frame=of_frames)
+        of_frames = replace(self._tasks.resolve_options(motion_options.frame), standing=None)
+        motion_options = replace(motion_options, frame=of_frames)
         self.pause()
         if history.state.moment is None:
             self._go(self.first)
@@ -921,7 +923,9 @@ class Timeline(QObject):
         # This Resolve also frees the frames of the last edit.
         self._tasks.cancel(Work.EASE)
         motion = self.motion
-        self.resolving.start(model, motion, chosen, within, partial(self._on_resolved, motion))
+        self.resolving.start(
+            model, motion, motion_options, within, partial(self._on_resolved, motion)
+        )
 
     def _on_resolved(self, asked: Motion, found: ResolvedMotion) -> None:
         history = self._history

@@ -528,8 +528,11 @@ class Mouse(QObject):
             if self.pin is not None:
                 self.vertex = self._document.history.pose.pins[self.pin].vertex
             elif handle is not None:
-                shown = [handle for handle in self._handles if handle.is_shown]
-                self.handle, self.vertex = shown[handle].domain, shown[handle].grip.vertex
+                visible_handles = [handle for handle in self._handles if handle.is_shown]
+                self.handle, self.vertex = (
+                    visible_handles[handle].domain,
+                    visible_handles[handle].grip.vertex,
+                )
             else:
                 picked = self._canvas.pick(place, scene.body)
                 self.vertex = None if picked is None else picked[0]
@@ -622,11 +625,11 @@ class Mouse(QObject):
             handle.is_shown = is_small and whole > _FAR_AWAY * pixel
             if handle.is_shown:
                 places.append(place)
-        shown = [handle.domain for handle in self._handles if handle.is_shown]
+        visible_domains = [handle.domain for handle in self._handles if handle.is_shown]
         scene.marks.show_handles(
             np.array(places).reshape(-1, 3),
-            [model.card.domain_colours[domain] for domain in shown],
-            shown.index(self.handle) if self.handle in shown else None,
+            [model.card.domain_colours[domain] for domain in visible_domains],
+            visible_domains.index(self.handle) if self.handle in visible_domains else None,
         )
 
     @property
@@ -723,13 +726,13 @@ class Mouse(QObject):
         grip = document.motion.grip_at(vertex)
         if self.handle is not None:
             (grip,) = (handle.grip for handle in self._handles if handle.domain == self.handle)
-        home = taken = grip.position(vertices)
+        home = grip_position = grip.position(vertices)
         if self.pin is not None:
-            home = taken = np.array(document.history.pose.pins[self.pin].position)
+            home = grip_position = np.array(document.history.pose.pins[self.pin].position)
             document.motion.begin_pin_drag(self.pin, whole_body)
         else:
             picked = None if self.handle is not None else self._canvas.pick(start, scene.body)
-            taken = taken if picked is None else picked[1]
+            grip_position = grip_position if picked is None else picked[1]
             document.motion.begin_drag(
                 grip, f"Drag {part_name(document.model, vertex)}", whole_body
             )
@@ -741,7 +744,13 @@ class Mouse(QObject):
         moving = limbs.carried(limbs.holding(grip.vertices, grip.weights), 2.0 * grip.radius)
         body_size = document.model.body_size
         depth = DragDepth(
-            scene.view, self._size, taken, vertices.copy(), document.model.faces, moving, body_size
+            scene.view,
+            self._size,
+            grip_position,
+            vertices.copy(),
+            document.model.faces,
+            moving,
+            body_size,
         )
         offset = home - depth.point(_pixel(start))
         places = [start]

@@ -145,17 +145,17 @@ def _draw_risk(scored: ScoredRows, path: Path) -> None:
 def _draw_roc(scored: ScoredRows, path: Path) -> None:
     """Draw the ROC curve: true positive rate by false positive rate, at each threshold."""
     auc, colliding = scored.auc, scored.rows.colliding
-    said = "one class is missing" if auc is None else f"area {auc:.4f}"
+    area_text = "one class is missing" if auc is None else f"area {auc:.4f}"
     chart = _chart(
-        f"ROC of {len(colliding)} held-out samples: {said}",
+        f"ROC of {len(colliding)} held-out samples: {area_text}",
         "false positive rate: free poses called colliding (%)",
         "true positive rate: colliding poses called colliding (%)",
     )
     chart.line([0.0, 100.0], [0.0, 100.0], color=_REFERENCE, style="--")
     if auc is not None:
         by, of = roc_curve(scored.logit, colliding)
-        kept = np.unique(np.linspace(0, len(by) - 1, _CURVE_POINTS).astype(int))
-        _add_line(chart, (100.0 * by[kept]).tolist(), (100.0 * of[kept]).tolist())
+        curve_points = np.unique(np.linspace(0, len(by) - 1, _CURVE_POINTS).astype(int))
+        _add_line(chart, (100.0 * by[curve_points]).tolist(), (100.0 * of[curve_points]).tolist())
     chart.y_range = _PERCENT
     save_chart(chart, path)
 

@@ -100,13 +100,13 @@ class LegendStrip(QWidget):
         self._note.setMinimumWidth(0 if self._note.wordWrap() else needed)
         rows: list[list[QWidget]] = [[]]
         used = NORMAL + CLOSE
-        shown = (
+        visible_rows = (
             True,
             bool(self.legend.ramp),
             bool(self.legend.crossing),
             bool(self.legend.uncounted),
         )
-        for block, is_shown in zip(self._blocks, shown, strict=True):
+        for block, is_shown in zip(self._blocks, visible_rows, strict=True):
             if not is_shown:
                 continue
             needed = block.minimumSizeHint().width()
@@ -120,7 +120,7 @@ class LegendStrip(QWidget):
         if not anew and len(rows) <= len(self._rows):
             return
         self._rows = rows
-        for block, is_shown in zip(self._blocks, shown, strict=True):
+        for block, is_shown in zip(self._blocks, visible_rows, strict=True):
             self._grid.removeWidget(block)
             block.setVisible(is_shown)
         for row, blocks in enumerate(rows):

@@ -178,7 +178,7 @@ class Marks:
         start, end, below = places_of(view, line, size)
         shapes: list[tuple[FloatArray, str]] = []
         around = self._body_size * _TARGET_RADIUS
-        seen = around / pixel_length(view, line[1], size)
+        radius = around / pixel_length(view, line[1], size)
         # The shadow lies flat on the ground.
         aside = np.eye(3)[[axis for axis in range(3) if not self._up[axis]]]
         rim = [
@@ -191,7 +191,7 @@ class Marks:
         shapes.append((shadow, _DARK))
         for half, colour in ((2.0, _DARK), (0.9, _LIGHT)):
             shapes.append((_bar(start, end, half), colour))
-            shapes.append((_ring(end, max(seen - half, 0.0), seen + half), colour))
+            shapes.append((_ring(end, max(radius - half, 0.0), radius + half), colour))
         return shapes
 
 
@@ -234,11 +234,11 @@ def _dot_at(dots: FloatArray, place: Pixel, view: View, size: Pixel) -> int | No
 
 def _thinned(places: FloatArray) -> list[FloatArray]:
     """Leave out positions that are near an earlier one."""
-    kept: list[FloatArray] = []
+    points: list[FloatArray] = []
     for place in places:
-        if all(np.linalg.norm(place - other) >= _APART for other in kept):
-            kept.append(place)
-    return kept
+        if all(np.linalg.norm(place - other) >= _APART for other in points):
+            points.append(place)
+    return points
 
 
 _OPACITY = 0.32
@@ -351,12 +351,12 @@ class FaceHighlight:
 
     def show(self, faces: npt.NDArray[np.integer] | None) -> None:
         """Draw the faces whose indices are in an array of any shape; None for none."""
-        chosen = np.unique(faces) if faces is not None else np.empty(0, dtype=np.int64)
+        face_numbers = np.unique(faces) if faces is not None else np.empty(0, dtype=np.int64)
         if self.hidden is not None:
-            chosen = chosen[~self.hidden[chosen]]
-        if len(chosen):
-            self._polydata.SetPolys(pv.CellArray.from_regular_cells(self._faces[chosen]))
-        self._set_visible(len(chosen) > 0)
+            face_numbers = face_numbers[~self.hidden[face_numbers]]
+        if len(face_numbers):
+            self._polydata.SetPolys(pv.CellArray.from_regular_cells(self._faces[face_numbers]))
+        self._set_visible(len(face_numbers) > 0)
 
     def look_like(self, other: FaceHighlight) -> None:
         """Show the faces of another highlight of the same mesh."""
@@ -416,12 +416,12 @@ class PartShape:
         faces : (F, 3) integer array
         domain : index from 0
         """
-        own = attention_mask[domain].astype(np.float64)
+        part_weights = attention_mask[domain].astype(np.float64)
         others = np.delete(attention_mask, domain, axis=0).max(axis=0, initial=0.0)
-        lead = _smooth(own - others, faces)
+        lead = _smooth(part_weights - others, faces)
         if not (lead > 0.0).any():
             # The domain dominates nowhere: take the region where its weight is large.
-            lead = own - 0.5 * own.max()
+            lead = part_weights - 0.5 * part_weights.max()
         inside = (lead > 0.0)[faces]
         count = inside.sum(axis=1)
         crossed = np.flatnonzero((count == 1) | (count == 2))

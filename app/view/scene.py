@@ -176,9 +176,9 @@ class Scene:
     def hide_faces(self, hidden: npt.NDArray[np.bool_] | None) -> None:
         """Hide faces, a (F,) bool array; None shows all."""
         self._hidden = hidden
-        shown = self._faces if hidden is None else self._faces[~hidden]
+        visible_faces = self._faces if hidden is None else self._faces[~hidden]
         for surface in (self.surface, self._ghost):
-            surface.draw(shown)
+            surface.draw(visible_faces)
         for highlight in (self.uncounted, self.crossing, self.named):
             highlight.hidden = hidden
         if self._textured is not None:

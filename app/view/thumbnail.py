@@ -62,12 +62,12 @@ def draw_pose(
     light = np.clip(lit, 0.0, 1.0)
     a, b, c = (points[corner] for corner in faces.T)
     turned = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] > 0.0
-    seen = faces[turned]
-    edges = np.abs(points[seen] - points[np.roll(seen, 1, axis=1)])[..., :2]
+    visible_faces = faces[turned]
+    edges = np.abs(points[visible_faces] - points[np.roll(visible_faces, 1, axis=1)])[..., :2]
     cuts = int(np.clip(math.ceil(np.quantile(edges, 0.98)) + 1, 1, _MOST_CUTS))
     weights = _barycentric(cuts)
-    dots = np.einsum("wk,fkd->fwd", weights, points[seen]).reshape(-1, 3)
-    shade = np.einsum("wk,fk->fw", weights, light[seen]).ravel()
+    dots = np.einsum("wk,fkd->fwd", weights, points[visible_faces]).reshape(-1, 3)
+    shade = np.einsum("wk,fk->fw", weights, light[visible_faces]).ravel()
     order = np.argsort(dots[:, 2], kind="stable")
     columns = np.floor(0.5 * n_dots + dots[order, 0]).astype(np.intp)
     rows = np.floor(0.5 * n_dots - dots[order, 1]).astype(np.intp)

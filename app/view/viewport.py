@@ -588,18 +588,18 @@ class Viewport(QWidget):
             middle = self._document.model.without_ground(frame.vertices).mean(axis=0)
             scene.view = self._preset("Three-quarter", middle + _GROWTH * (frame.vertices - middle))
         elif self._transition_to is not None and np.array_equal(self._transition_to, frame.latent):
-            shown = np.array(scene.surface.vertices)
-            self._transition.begin(partial(_between_poses, shown, frame.vertices))
+            visible_points = np.array(scene.surface.vertices)
+            self._transition.begin(partial(_between_poses, visible_points, frame.vertices))
         else:
             scene.show(frame.vertices, frame.normals)
             if before is not None and self.follows and moment != self._moment:
                 axis = self._document.model.up_axis
-                seen = self._document.model.without_ground
-                old, new = seen(before.vertices), seen(frame.vertices)
+                without_ground = self._document.model.without_ground
+                old, new = without_ground(before.vertices), without_ground(frame.vertices)
                 scene.view = followed(scene.view, old, new, axis, self._aspect)
             if frame.latent is self._loaded and before is not None:
-                seen = self._document.model.without_ground
-                old, new = seen(before.vertices), seen(frame.vertices)
+                without_ground = self._document.model.without_ground
+                old, new = without_ground(before.vertices), without_ground(frame.vertices)
                 view = kept_in_view(scene.view, old, new, self._aspect)
                 if view is not None:
                     self._turn.begin(partial(between, scene.view, view))
@@ -658,8 +658,8 @@ class Viewport(QWidget):
 
     @property
     def _aspect(self) -> float:
-        seen = self if self.canvas is None else self.canvas
-        return seen.width() / max(1, seen.height())
+        widget = self if self.canvas is None else self.canvas
+        return widget.width() / max(1, widget.height())
 
     # Animation.
 

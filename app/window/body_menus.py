@@ -151,8 +151,8 @@ class BodyMenus(QObject):
         if space is None:
             return
         codes = model.latent_space.groups[0 if domain is None else 1 + domain].codes
-        own = slice(code, code + 1) if code is not None else codes
-        joints = {joint for joint in space.joint_of_code[own].tolist() if joint >= 0}
+        joint_codes = slice(code, code + 1) if code is not None else codes
+        joints = {joint for joint in space.joint_of_code[joint_codes].tolist() if joint >= 0}
         if domain is None or len(joints) != 1:
             return
         joint = joints.pop()

@@ -49,14 +49,14 @@ def copy_pose(document: PoseDocument, vertex: int | None = None) -> None:
     vertex : if given, copy only its limb
     """
     model, latent = document.model, document.history.latent
-    chosen = _codes_of(document, vertex)
+    copied_codes = _codes_of(document, vertex)
     what = "the pose" if vertex is None else f"the limb of {part_name(model, vertex)}"
     copied = CopiedPose(
         model.fingerprint,
         model.name,
         what,
         tuple(latent.tolist()),
-        tuple(np.flatnonzero(chosen).tolist()),
+        tuple(np.flatnonzero(copied_codes).tolist()),
     )
     data = QMimeData()
     data.setData(_KIND, json.dumps(asdict(copied)).encode())
@@ -81,15 +81,15 @@ def paste_pose(document: PoseDocument, vertex: int | None = None) -> None:
             f"the copied pose is one of “{copied.name}”, not of “{model.name}”",
             "copy a pose of this body",
         )
-    chosen = np.zeros(model.latent_size, dtype=np.bool_)
-    chosen[list(copied.codes)] = True
-    chosen &= _codes_of(document, vertex)
-    if not chosen.any():
+    pasted_codes = np.zeros(model.latent_size, dtype=np.bool_)
+    pasted_codes[list(copied.codes)] = True
+    pasted_codes &= _codes_of(document, vertex)
+    if not pasted_codes.any():
         raise LCollisionError(
             f"what was copied, {copied.what}, has nothing of this limb", "copy the whole pose"
         )
-    what = "pose" if vertex is None and chosen.all() else "limb"
-    document.motion.paste(f"Paste {what}", np.array(copied.latent), chosen)
+    what = "pose" if vertex is None and pasted_codes.all() else "limb"
+    document.motion.paste(f"Paste {what}", np.array(copied.latent), pasted_codes)
 
 
 def _codes_of(document: PoseDocument, vertex: int | None) -> npt.NDArray[np.bool_]:

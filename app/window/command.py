@@ -337,8 +337,10 @@ class Commands(QObject):
                 else:
                     menu.addActions(group.actions())
             else:
-                made = entry(self._window)
-                menu.addActions([made.menuAction()] if isinstance(made, QMenu) else list(made))
+                filled = entry(self._window)
+                menu.addActions(
+                    [filled.menuAction()] if isinstance(filled, QMenu) else list(filled)
+                )
 
     @Slot()
     def _on_triggered(self) -> None:

@@ -56,20 +56,22 @@ def why_no_window(environment: Mapping[str, str], platform: str) -> str | None:
     """
     if platform in ("win32", "darwin"):
         return None
-    asked = environment.get(_CHOICE, "")
+    platform_list = environment.get(_CHOICE, "")
     wayland, display = environment.get("WAYLAND_DISPLAY"), environment.get("DISPLAY")
-    if not asked and not wayland and not display:
+    if not platform_list and not wayland and not display:
         return "neither DISPLAY nor WAYLAND_DISPLAY is set"
     # Like Qt, try one after the other until one works.
-    chosen = [name.partition(":")[0] for name in asked.split(";")] if asked else []
-    names = chosen or ["wayland"] * bool(wayland) + ["xcb"] * bool(display)
+    platforms = (
+        [name.partition(":")[0] for name in platform_list.split(";")] if platform_list else []
+    )
+    names = platforms or ["wayland"] * bool(wayland) + ["xcb"] * bool(display)
     reasons = []
     for name in names:
         reason = _why_not_by(name, environment)
         if reason is None:
             return None
         reasons.append(reason)
-    unset = f": unset {_CHOICE}, which is {asked!r}" if asked else ""
+    unset = f": unset {_CHOICE}, which is {platform_list!r}" if platform_list else ""
     return f"{' and '.join(reasons)}{unset}"
 
 
@@ -139,14 +141,14 @@ def _surface_format() -> QSurfaceFormat:
     """
     from PySide6.QtGui import QSurfaceFormat
 
-    wanted = QSurfaceFormat()
-    wanted.setRenderableType(QSurfaceFormat.RenderableType.OpenGL)
-    wanted.setProfile(QSurfaceFormat.OpenGLContextProfile.CoreProfile)
-    wanted.setVersion(3, 2)
-    wanted.setDepthBufferSize(8)
-    wanted.setAlphaBufferSize(8)
-    wanted.setStencilBufferSize(0)
-    return wanted
+    surface_format = QSurfaceFormat()
+    surface_format.setRenderableType(QSurfaceFormat.RenderableType.OpenGL)
+    surface_format.setProfile(QSurfaceFormat.OpenGLContextProfile.CoreProfile)
+    surface_format.setVersion(3, 2)
+    surface_format.setDepthBufferSize(8)
+    surface_format.setAlphaBufferSize(8)
+    surface_format.setStencilBufferSize(0)
+    return surface_format
 
 
 def make_application(settings: Settings) -> QApplication:

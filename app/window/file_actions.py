@@ -79,8 +79,8 @@ def _kinds(*wanted: str) -> str:
     }
     filters = [f"{kind.capitalize()} ({masks[kind]})" for kind in wanted]
     if len(wanted) > 1:
-        known = dict.fromkeys(" ".join(masks[kind] for kind in wanted).split())
-        filters.insert(0, f"All supported files ({' '.join(known)})")
+        patterns = dict.fromkeys(" ".join(masks[kind] for kind in wanted).split())
+        filters.insert(0, f"All supported files ({' '.join(patterns)})")
     return ";;".join(filters)
 
 
@@ -290,8 +290,8 @@ class FileActions(QObject):
         if all(map(is_learned_from, paths)):
             self.learning_wanted.emit(tuple(paths))
             return
-        known = (POSES_SUFFIX, MODEL_SUFFIX, *READABLE_SUFFIXES, *CHARACTER_SUFFIXES)
-        path = next((dropped for dropped in paths if dropped.suffix.lower() in known), paths[0])
+        suffixes = (POSES_SUFFIX, MODEL_SUFFIX, *READABLE_SUFFIXES, *CHARACTER_SUFFIXES)
+        path = next((dropped for dropped in paths if dropped.suffix.lower() in suffixes), paths[0])
         document = self._document
         may_join = document.has_model and not document.model.is_trained
         self.open_path(path, beside=document.model if may_join else None)
@@ -319,8 +319,8 @@ class FileActions(QObject):
         if self.may_lose_changes(with_library=False):
             number = [member.name for member in scene.members].index(name)
             file = playing(scene.file, number, clip, start)
-            kept = str(kept_scene(file))
-            self._document.replay(scene.with_file(replace(file, path=kept)), kept)
+            scene_path = str(kept_scene(file))
+            self._document.replay(scene.with_file(replace(file, path=scene_path)), scene_path)
 
     def toggle_ground(self) -> None:
         """Add or remove a level ground in the check; the body is reopened in its pose."""
@@ -381,17 +381,21 @@ class FileActions(QObject):
         """Ask for a file and save; see `save`."""
         document = self._document
         document.motion.end_gesture()
-        model, poses, asked = document.model, document.history.file_poses, document.history.pose
+        model, poses, asked_pose = (
+            document.model,
+            document.history.file_poses,
+            document.history.pose,
+        )
         path = self.ask_save(
             "Save poses", self._name, {"Poses": POSES_SUFFIX}, document.history.file
         )
         if path is None:
             return False
-        if document.history.pose is asked:
+        if document.history.pose is asked_pose:
             document.tasks.save(path)
         else:
             # Another pose was opened while the dialog was shown.
-            pose = named_after(asked, path)
+            pose = named_after(asked_pose, path)
             text = f"Saved “{pose.name}” to {path.name}; the pose opened since is unsaved"
             document.tasks.save_file(
                 path, unwatched(save_poses, path, model, poses, pose), lambda _: text
@@ -414,8 +418,10 @@ class FileActions(QObject):
             return
         # Capture the model and pose now: others may be opened while the dialogs are shown.
         state = document.history.state
-        own = None if state.moment is None else state.moment.space
-        export = partial(exporting.export, document.model, state.pose, state.outcome, own=own)
+        frame_space = None if state.moment is None else state.moment.space
+        export = partial(
+            exporting.export, document.model, state.pose, state.outcome, own=frame_space
+        )
         form = ExportDialog(self.settings, self._window, document.model)
         accepted = form.exec() == QDialog.DialogCode.Accepted
         kinds, style = form.kinds, form.export_request
@@ -471,15 +477,15 @@ class FileActions(QObject):
         kinds, request, frames = form.kinds, form.export_request, form.frames
         is_clip = form.is_clip
         form.deleteLater()
-        own = file.suffix.lower()
+        own_suffix = file.suffix.lower()
         is_own_smpl = is_smpl_motion(file) and timeline.joints is None
         if is_own_smpl:
-            kinds = {_kind(file): own, **kinds}
+            kinds = {_kind(file): own_suffix, **kinds}
         name = f"{Path(motion.source).stem or motion.name}, resolved"
         path = self.ask_save("Export motion", name, kinds) if accepted else None
         if path is None:
             return False
-        is_clip = is_clip or (is_own_smpl and path.suffix.lower() == own)
+        is_clip = is_clip or (is_own_smpl and path.suffix.lower() == own_suffix)
 
         def done(told: str) -> None:
             timeline.mark_saved([now for _, now in changes] if is_clip else [motion])
@@ -522,14 +528,14 @@ class FileActions(QObject):
         from lcollision_core.tasks.scenes import files_of_members
 
         title, start = "Export each body to a folder", str(self._folder())
-        chosen = QFileDialog.getExistingDirectory(self._window, title, start)
-        if not chosen:
+        folder = QFileDialog.getExistingDirectory(self._window, title, start)
+        if not folder:
             return None
-        files = files_of_members(Path(chosen), scene, of_motion=of_motion)
+        files = files_of_members(Path(folder), scene, of_motion=of_motion)
         there = [file for file in files if file.exists()]
         if there and not ask_to_replace_files(self._window, there):
             return None
-        return Path(chosen)
+        return Path(folder)
 
     def write_frames(
         self,
@@ -585,9 +591,9 @@ class FileActions(QObject):
         path = self._ask_save_after(form, "Save video", _VIDEOS)
         if path is not None:
             style = self._video_style()
-            shown = motion.part(range(timeline.first, timeline.last + 1)).at_rate(style.rate)
-            style = replace(style, seconds=len(shown) / style.rate)
-            self._viewport.pictures.motion(path, style, shown, self._viewport.follows)
+            shown_motion = motion.part(range(timeline.first, timeline.last + 1)).at_rate(style.rate)
+            style = replace(style, seconds=len(shown_motion) / style.rate)
+            self._viewport.pictures.motion(path, style, shown_motion, self._viewport.follows)
 
     def _video_style(self) -> TurntableStyle:
         from app.view.offscreen import TurntableStyle

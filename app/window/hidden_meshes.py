@@ -62,8 +62,8 @@ class HiddenMeshes(QObject):
         model = self._document.model if self._document.has_model else None
         if model is None or model.character is None:
             return ()
-        own = tuple(group for group in model.character.groups if not group.is_material)
-        return own if len(own) > 1 else ()
+        mesh_groups = tuple(group for group in model.character.groups if not group.is_material)
+        return mesh_groups if len(mesh_groups) > 1 else ()
 
     @property
     def hidden(self) -> tuple[str, ...]:

@@ -113,8 +113,8 @@ class Layout(QObject):
         if window.corner(corner) is not area:
             window.setCorner(corner, area)
         suiting = self._beside({key: self._suiting(key) for key in self._widths()}, _VIEW_WIDTH)
-        chosen = {key: int(self._settings[f"{key}_width"] or suiting[key]) for key in suiting}
-        widths = self._beside(chosen, _LEAST_VIEW_WIDTH)
+        panel_widths = {key: int(self._settings[f"{key}_width"] or suiting[key]) for key in suiting}
+        widths = self._beside(panel_widths, _LEAST_VIEW_WIDTH)
         docks = [self._docks[key] for key in widths]
         window.resizeDocks(docks, list(widths.values()), Qt.Orientation.Horizontal)
 

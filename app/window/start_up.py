@@ -101,8 +101,8 @@ class StartUp(QObject):
     def _on_first_pose(self) -> None:
         if self._path is not None:
             path = self._path
-            chosen = self._body_is_chosen
-            self._window.attempt(lambda: self._window.files.open_path(path, chosen))
+            is_chosen = self._body_is_chosen
+            self._window.attempt(lambda: self._window.files.open_path(path, is_chosen))
             return
         # The opening pose is not a change to save or undo.
         self._document.history.begin_with(opening_pose(self._document.model))

@@ -626,8 +626,8 @@ def equip(action: QAction, text: str, shortcut: str, tip: str) -> None:
 
 def explain(action: QAction, tip: str) -> None:
     """Set an action's tool tip and status tip; the tool tip also names the shortcut."""
-    shown = action.shortcut().toString(NATIVE)
-    action.setToolTip(f"{tip} ({shown})" if shown else tip)
+    keys = action.shortcut().toString(NATIVE)
+    action.setToolTip(f"{tip} ({keys})" if keys else tip)
     action.setStatusTip(tip)
 
 
@@ -789,18 +789,18 @@ class Mnemonics(QObject):
             button for button in buttons if button not in named
         ]
         items += labels
-        taken = set[str]()
+        letters = set[str]()
         new: list[QAbstractButton | QLabel] = []
         for item in (item for item in items if item.isVisibleTo(self._dialog)):
             letter = mnemonic(item.text())
-            if letter and letter not in taken:
-                taken.add(letter)
+            if letter and letter not in letters:
+                letters.add(letter)
             else:
                 new.append(item)
         for item in new:
             text = _MARK.sub(lambda found: found[1] or "&&", item.text())
-            marked = _with_mark(text, taken)
-            taken.add(mnemonic(marked))
+            marked = _with_mark(text, letters)
+            letters.add(mnemonic(marked))
             if marked != item.text():
                 item.setText(marked)
 

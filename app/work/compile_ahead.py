@@ -111,8 +111,8 @@ def is_compiled() -> bool:
     # it and ends at once.
     folder = Path(lcollision_core.__file__).parent / "contact"
     newest = (folder / "kernels.py").stat().st_mtime
-    kept = environ.get("NUMBA_CACHE_DIR")
-    places = Path(kept).glob("contact_*") if kept else [folder / "__pycache__"]
+    cache_folder = environ.get("NUMBA_CACHE_DIR")
+    places = Path(cache_folder).glob("contact_*") if cache_folder else [folder / "__pycache__"]
     name = f"kernels.look_again-*.py{sys.version_info.major}{sys.version_info.minor}*.nbi"
     return any(file.stat().st_mtime >= newest for place in places for file in place.glob(name))
 

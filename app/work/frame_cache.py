@@ -54,8 +54,8 @@ class _Worker(QObject):
     @Slot()
     def work(self) -> None:
         """Compute one frame after the other, always the most urgent."""
-        while (wanted := self._cache.next_wanted()) is not None:
-            model, motion, number, predicts = wanted
+        while (request := self._cache.next_wanted()) is not None:
+            model, motion, number, predicts = request
             answer = guarded("showing a frame", self._frame, model, motion, number, predicts)
             self._cache.put(model, motion, number, answer)
 
@@ -66,8 +66,8 @@ class _Worker(QObject):
         if predicts:
             keep_torch_to_one_thread(model)
         evaluator.predicts = predicts
-        own = motion.space(number, model.space)
-        return evaluator.frame(motion.codes[number], False, motion.placement(number), own)
+        frame_space = motion.space(number, model.space)
+        return evaluator.frame(motion.codes[number], False, motion.placement(number), frame_space)
 
 
 class FrameCache(QObject):
@@ -170,8 +170,8 @@ class FrameCache(QObject):
 
 def _key(motion: Motion, number: int) -> _Key:
     # If all frames share one body, equal codes give equal frames.
-    own = motion.space_at
-    return motion.codes[number].tobytes(), own, 0 if own is None else number
+    frame_space = motion.space_at
+    return motion.codes[number].tobytes(), frame_space, 0 if frame_space is None else number
 
 
 def _bytes_of(frame: PoseFrame) -> int:

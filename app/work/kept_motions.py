@@ -91,7 +91,7 @@ def to_keep(motions: EditedMotions) -> dict[str, Any]:
     ------
     LCollisionError : the codes exceed `MOST_BYTES`.
     """
-    kept, n_bytes = [], 0
+    kept_frames, n_bytes = [], 0
     for name, now in motions.edited.items():
         changed = np.flatnonzero((now.codes != motions.read[name].codes).any(axis=1))
         codes = now.codes[changed].astype("<f8").tobytes()
@@ -101,9 +101,11 @@ def to_keep(motions: EditedMotions) -> dict[str, Any]:
             raise LCollisionError(what, "export the motion", where=f"the motion “{motions.open}”")
         shape = len(now), now.codes.shape[1]
         text = base64.b64encode(codes).decode()
-        kept.append(_KeptMotion(name, shape, tuple(changed.tolist()), text, name in motions.saved))
+        kept_frames.append(
+            _KeptMotion(name, shape, tuple(changed.tolist()), text, name in motions.saved)
+        )
     file, stamp = str(motions.file.absolute()), motions.stamp
-    return to_json(_Kept(file, stamp, motions.open, motions.frame, tuple(kept)))
+    return to_json(_Kept(file, stamp, motions.open, motions.frame, tuple(kept_frames)))
 
 
 def read_lost(
@@ -153,8 +155,8 @@ def _opened_in_shape(
     except (OSError, ValueError):
         # Reading the poses reports it.
         return None
-    kept = document.get(KEY) if isinstance(document, dict) else None
-    file = kept.get("file") if isinstance(kept, dict) else None
+    stored = document.get(KEY) if isinstance(document, dict) else None
+    file = stored.get("file") if isinstance(stored, dict) else None
     if not isinstance(file, str) or not is_smpl_motion(file):
         return None
     body = model or open_to_show(model_file, job).model
@@ -168,33 +170,33 @@ def _motions(body: Body, path: Path, job: Job) -> EditedMotions | None:
     if document is None:
         return None
     try:
-        kept = from_json(_Kept, document, "the motion")
+        stored = from_json(_Kept, document, "the motion")
     except ValueError as error:
         raise _lost("the motion", str(error)) from error
-    file, name = Path(kept.file), f"“{kept.open}”"
-    why = why_gone(file, kept.stamp)
+    file, name = Path(stored.file), f"“{stored.open}”"
+    why = why_gone(file, stored.stamp)
     if why:
         raise _lost(name, why)
     own_file = own_motions(body)[0]
     is_own = own_file is not None and own_file.absolute() == file.absolute()
-    chosen = [motion.name for motion in kept.motions] if is_own else [None]
+    clip_names = [motion.name for motion in stored.motions] if is_own else [None]
     read_one = partial(read_motions, body, own_file if is_own and own_file else file, job=job)
     try:
-        read = {motion.name: motion for clip in chosen for motion in read_one(clip)}
+        read = {motion.name: motion for clip in clip_names for motion in read_one(clip)}
     except LCollisionError as error:
         raise _lost(name, error.headline) from error
     edited = {}
-    for kept_motion in kept.motions:
+    for kept_motion in stored.motions:
         was = read.get(kept_motion.name)
-        if was is None or was.codes.shape != kept_motion.shape or not 0 <= kept.frame < len(was):
+        if was is None or was.codes.shape != kept_motion.shape or not 0 <= stored.frame < len(was):
             raise _lost(name, f"{file.name} has other frames than before")
         edited[kept_motion.name] = (
             replace(was, codes=_codes(was, kept_motion)) if kept_motion.frames else was
         )
-    if kept.open not in edited:
+    if stored.open not in edited:
         raise _lost(name, "its edits are not among those that were kept")
-    saved = frozenset(kept_motion.name for kept_motion in kept.motions if kept_motion.is_saved)
-    return EditedMotions(file, kept.stamp, kept.open, kept.frame, read, edited, saved)
+    saved = frozenset(kept_motion.name for kept_motion in stored.motions if kept_motion.is_saved)
+    return EditedMotions(file, stored.stamp, stored.open, stored.frame, read, edited, saved)
 
 
 def _codes(was: Motion, kept: _KeptMotion) -> FloatArray:

@@ -276,6 +276,6 @@ def _environment() -> QProcessEnvironment:
     environment = QProcessEnvironment.systemEnvironment()
     root = Path(app.__file__).parents[1]
     if root.name != "site-packages":
-        known = environment.value("PYTHONPATH")
-        environment.insert("PYTHONPATH", os.pathsep.join(filter(None, (str(root), known))))
+        python_path = environment.value("PYTHONPATH")
+        environment.insert("PYTHONPATH", os.pathsep.join(filter(None, (str(root), python_path))))
     return environment

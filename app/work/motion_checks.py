@@ -100,11 +100,11 @@ def coarse_to_fine(n_frames: int) -> list[int]:
 
 def path_of_vertex(body: Body, motion: Motion, frames: range, vertex: int, job: Job) -> FloatArray:
     """Return the (N, 3) drawn positions of a vertex in frames of a motion, in the data's unit."""
-    chosen, places = np.array([vertex]), np.empty((len(frames), 3))
+    vertices, places = np.array([vertex]), np.empty((len(frames), 3))
     for row, frame in enumerate(frames):
         job.check()
         space = motion.space(frame, body.space)
-        places[row] = space.decode_some(motion.codes[frame][None], chosen)[0, 0] * body.body_size
+        places[row] = space.decode_some(motion.codes[frame][None], vertices)[0, 0] * body.body_size
         job.report(row, len(frames))
     return places
 

@@ -145,8 +145,8 @@ class PoseWorker(QObject):
         if request.start is None:
             if request.space is None:
                 return evaluator.frame(request.target.aim)
-            own = request.space()
-            return evaluator.frame(request.target.aim, True, request.placement, own)
+            frame_space = request.space()
+            return evaluator.frame(request.target.aim, True, request.placement, frame_space)
         return evaluator.moved(self._begun(request.model, request.start), request.target.aim)
 
     def _begun(self, model: Body, start: MotionStart) -> PoseDragger:

@@ -387,17 +387,17 @@ def fit_rings(
     gram = np.einsum("v,va,vb->vab", row_weight, normals, normals)
     np.add.at(gram, owner, np.einsum("r,ra,rb->rab", weight, spoke, spoke))
     values, axes = np.linalg.eigh(gram)
-    seen = values > _LOST_DIRECTION * values[:, -1:]
-    inverse_values = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
+    is_spanned = values > _LOST_DIRECTION * values[:, -1:]
+    inverse_values = np.where(is_spanned, 1.0 / np.where(is_spanned, values, 1.0), 0.0)
     inverse = np.einsum("vab,vb,vcb->vac", axes, inverse_values, axes)
-    kept = np.einsum("vab,vb,vcb->vac", axes, np.where(seen, 0.0, 1.0), axes)
+    lost_directions = np.einsum("vab,vb,vcb->vac", axes, np.where(is_spanned, 0.0, 1.0), axes)
     return RingFit(
         faces=topology.faces,
         ring_start=start,
         ring=ring,
         ring_solution=np.einsum("rab,rb,r->ra", inverse[owner], spoke, weight),
         normal_solution=np.einsum("vab,vb,v->va", inverse, normals, row_weight),
-        kept_identity=kept,
+        kept_identity=lost_directions,
     )
 
 

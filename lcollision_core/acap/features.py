@@ -74,9 +74,9 @@ def gradients_from_features(features: FloatArray, gradients: FloatArray) -> Floa
     rotation = np.empty((3, 3))
     for pose in range(len(features)):
         for i in range(features.shape[1]):
-            own = features[pose, i]
-            exponential(own[0], own[1], own[2], rotation)
-            stretch_product(rotation, own[3:], gradients[pose, i])
+            vertex_features = features[pose, i]
+            exponential(vertex_features[0], vertex_features[1], vertex_features[2], rotation)
+            stretch_product(rotation, vertex_features[3:], gradients[pose, i])
     return gradients
 
 
@@ -350,7 +350,7 @@ def component_bridges(
     of_tree = np.zeros(shape, dtype=np.bool_)
     of_tree[tree.row, tree.col] = True
     rank = np.arange(len(edges)) - first[pair_of.ravel()]
-    chosen = of_tree[tuple(ends.T)] & (rank < _EDGES_EACH)
+    bridging = of_tree[tuple(ends.T)] & (rank < _EDGES_EACH)
     if layers:
         normals = vertex_normals(rest_vertices, topology.faces)[used]
         same_way = (normals[edges[:, 0]] * normals[edges[:, 1]]).sum(axis=1) > _SAME_WAY
@@ -359,8 +359,8 @@ def component_bridges(
             # Edges are sorted by length, so a vertex's first edge to a component is the shortest.
             place = np.flatnonzero(covers)
             key = edges[place, own].astype(np.int64) * n_components + of_point[edges[place, other]]
-            chosen[place[np.unique(key, return_index=True)[1]]] = True
-    bridges: IntArray = used[edges[chosen]].astype(np.int32)
+            bridging[place[np.unique(key, return_index=True)[1]]] = True
+    bridges: IntArray = used[edges[bridging]].astype(np.int32)
     return np.unique(np.sort(bridges, axis=1), axis=0) if layers else bridges
 
 
@@ -382,5 +382,5 @@ def _to_the_largest(points: FloatArray, of_point: npt.NDArray[np.intp]) -> npt.N
     distance, nearest = cKDTree(points[main]).query(points[others])
     order = np.lexsort((distance, of_point[others]))
     _, first = np.unique(of_point[others][order], return_index=True)
-    chosen = order[first]
-    return np.stack([others[chosen], main[nearest[chosen]]], axis=1)
+    first_edges = order[first]
+    return np.stack([others[first_edges], main[nearest[first_edges]]], axis=1)

@@ -239,18 +239,18 @@ def _choose_turn(q: FloatArray, near: FloatArray, log: FloatArray) -> None:
     opposes that of `near`, then whole turns are added until the angles agree to pi.
     """
     half_sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    wanted = math.sqrt(near[0] * near[0] + near[1] * near[1] + near[2] * near[2])
+    near_angle = math.sqrt(near[0] * near[0] + near[1] * near[1] + near[2] * near[2])
     if half_sine > _AXIS_DEFINED_ABOVE:
         angle = 2.0 * math.atan2(half_sine, q[0])
         x, y, z = q[1] / half_sine, q[2] / half_sine, q[3] / half_sine
         if x * near[0] + y * near[1] + z * near[2] < 0.0:
-            wanted = -wanted
-        angle += _TURN * math.floor((wanted - angle) / _TURN + 0.5)
+            near_angle = -near_angle
+        angle += _TURN * math.floor((near_angle - angle) / _TURN + 0.5)
         log[0], log[1], log[2] = angle * x, angle * y, angle * z
         return
     # No defined axis: whole turns about that of `near`.
-    turns = math.floor(wanted / _TURN + 0.5)
-    scale = turns * _TURN / wanted if turns > 0.0 else 0.0
+    turns = math.floor(near_angle / _TURN + 0.5)
+    scale = turns * _TURN / near_angle if turns > 0.0 else 0.0
     for a in range(3):
         log[a] = scale * near[a] + 2.0 * q[1 + a]
 

@@ -86,23 +86,23 @@ def export_frame(
     scale : file units per model unit; by default `export_scale`
     placement : of an imported mesh; it already applies the mesh's unit
     """
-    chosen = ExportAxes(axes)
+    preset = ExportAxes(axes)
     suffix = Path(path).suffix.lower()
     if suffix in _ALREADY_FIXED:
         return RigidTransform(
             np.eye(3), np.zeros(3), model.card.metres if placement is None else 1.0
         )
     factor = export_scale(model, axes) if scale is None else scale
-    if chosen is ExportAxes.MODEL:
+    if preset is ExportAxes.MODEL:
         return RigidTransform(np.eye(3), np.zeros(3), factor)
     up, front = _Y, _Z
-    if chosen is ExportAxes.UNREAL:
+    if preset is ExportAxes.UNREAL:
         up, front = _Z, _X
-    elif chosen is ExportAxes.BLENDER and suffix != ".obj":
+    elif preset is ExportAxes.BLENDER and suffix != ".obj":
         up, front = _Z, -_Y
     own_up, own_front = _AXES[model.up_axis], model.front
-    own = np.stack([own_up, own_front, np.cross(own_up, own_front)])
-    turn = np.stack([up, front, np.cross(up, front)]).T @ own
+    model_axes = np.stack([own_up, own_front, np.cross(own_up, own_front)])
+    turn = np.stack([up, front, np.cross(up, front)]).T @ model_axes
     # Adding 0 turns -0 into 0.
     return RigidTransform(turn + 0.0, np.zeros(3), factor)
 
@@ -147,12 +147,12 @@ def _detail(model: Body, vertices: npt.NDArray[Any]) -> ObjDetail | None:
 
     The groups are the body's meshes, else its body parts.
     """
-    own, parts = (model.groups_by_kind[kind] for kind in GROUP_KINDS[:2])
+    file_groups, parts = (model.groups_by_kind[kind] for kind in GROUP_KINDS[:2])
     uv, uv_faces = _texture_coordinates(model)
-    if not own and not len(uv):
+    if not file_groups and not len(uv):
         return None
-    materials = [group for group in own if group.is_material]
-    meshes = [group for group in own if not group.is_material] or list(parts)
+    materials = [group for group in file_groups if group.is_material]
+    meshes = [group for group in file_groups if not group.is_material] or list(parts)
     normals, normal_faces = corner_normals(vertices, model.faces, model.reference)
     return ObjDetail(
         normals,
@@ -306,15 +306,17 @@ class SourceFile:
         self._character: Character | None = None
         self.frame: RigidTransform | None = None
         suffix = self.path.suffix.lower()
-        own = body.character
-        is_own = own is not None and _is_same_file(own.source, self.path)
+        character = body.character
+        is_own = character is not None and _is_same_file(character.source, self.path)
         self.forms = offered_forms(path, has_rig=is_own)
         if suffix == ".obj":
             mesh = read_mesh(path, topology=body.topology)
             body.require_topology(mesh.topology, str(path))
         elif suffix in SCENE_SUFFIXES:
             self._character = (
-                own if own is not None and is_own else read_character(path, topology=body.topology)
+                character
+                if character is not None and is_own
+                else read_character(path, topology=body.topology)
             )
             body.require_topology(self._character.topology, str(path))
             self._require_unit(self._character)
@@ -354,10 +356,10 @@ class SourceFile:
             if fits and key in (None, form.key):
                 return form
         offered = ", ".join(f"{form.key} ({form.suffix})" for form in self.forms)
-        wanted = suffix or "a name without extension"
+        extension = suffix or "a name without extension"
         raise MeshFileError.unwritable(
             path,
-            f"{self.path.name} does not offer {wanted}{f' with the form {key}' if key else ''}",
+            f"{self.path.name} does not offer {extension}{f' with the form {key}' if key else ''}",
             f"choose one of its forms: {offered}",
         )
 
@@ -518,12 +520,12 @@ def shapes_in_file(
     space: RigPoseSpace | None, made: GltfCharacter, codes: FloatArray
 ) -> FloatArray | None:
     """Return (..., S) shape codes of (..., D) codes, in a glTF file's order; None without."""
-    own = None if space is None else space.rig.shapes
-    held = None if made.character.rig is None else made.character.rig.shapes
-    if space is None or own is None or held is None:
+    body_shapes = None if space is None else space.rig.shapes
+    file_shapes = None if made.character.rig is None else made.character.rig.shapes
+    if space is None or body_shapes is None or file_shapes is None:
         return None
     numbers: FloatArray = codes[..., space.are_shapes]
-    return numbers[..., [own.names.index(name) for name in held.names]]
+    return numbers[..., [body_shapes.names.index(name) for name in file_shapes.names]]
 
 
 def source_for(
@@ -544,11 +546,13 @@ def source_for(
     """
     if like is not None:
         return SourceFile(like, body)
-    own = own_source(body)
-    if own is not None:
-        suffixes = {form.suffix for form in offered_forms(own, has_rig=body.joints is not None)}
-        if suffix.lower() in suffixes or suffix.lower() == own.suffix.lower() == ".vrm":
-            return SourceFile(own, body)
+    own_file = own_source(body)
+    if own_file is not None:
+        suffixes = {
+            form.suffix for form in offered_forms(own_file, has_rig=body.joints is not None)
+        }
+        if suffix.lower() in suffixes or suffix.lower() == own_file.suffix.lower() == ".vrm":
+            return SourceFile(own_file, body)
     return None
 
 
@@ -570,8 +574,8 @@ def own_source(body: Body) -> Path | None:
     path = Path(first)
     if path.is_dir():
         path = next(iter(mesh_files(path)[0]), path)
-    kept = {suffix for form in EXPORT_FORMS for suffix in form.of_sources}
-    return path if path.suffix.lower() in kept and path.is_file() else None
+    suffixes = {suffix for form in EXPORT_FORMS for suffix in form.of_sources}
+    return path if path.suffix.lower() in suffixes and path.is_file() else None
 
 
 def requested_form(
@@ -631,16 +635,16 @@ def write_pose(
     ------
     MeshFileError : the file cannot be written, or cannot hold the pose in that form.
     """
-    target, chosen = Path(path), requested_form(path, request, source)
+    target, form = Path(path), requested_form(path, request, source)
     frame = export_frame(body, request.axes, path, request.scale, placement)
-    if source is not None and chosen is not None and source.frame is not None:
+    if source is not None and form is not None and source.frame is not None:
         frame = source.frame
     unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
-    if source is None or chosen is None:
+    if source is None or form is None:
         return WrittenPose(target, export_mesh(path, body, vertices, placement, frame), unit)
     placed = as_stored(path, frame.apply(vertices), body.topology)
     stored, notes = source.write(
-        path, chosen, placed, latent, placement, keep_clips=request.keep_clips
+        path, form, placed, latent, placement, keep_clips=request.keep_clips
     )
     return WrittenPose(target, stored, unit, notes)
 
@@ -680,15 +684,17 @@ def write_sequence(
     """
     files = sequence_files(path, body, source)
     if Path(path).suffix.lower() in SKELETON_SUFFIXES:
-        shown, notes = write_skeleton(path, body, latents, vertices, request.fps)
+        shown_vertices, notes = write_skeleton(path, body, latents, vertices, request.fps)
         return list(files), _Frames(
-            len(latents), lambda frame: WrittenPose(Path(path), shown(frame), 1.0, notes)
+            len(latents), lambda frame: WrittenPose(Path(path), shown_vertices(frame), 1.0, notes)
         )
     if source is not None and source.require_form(path, None).suffix == ".glb":
-        own = source.frame or export_frame(body, request.axes, path)
-        frames = np.stack([as_stored(path, own.apply(pose), body.topology) for pose in vertices])
+        file_frame = source.frame or export_frame(body, request.axes, path)
+        frames = np.stack(
+            [as_stored(path, file_frame.apply(pose), body.topology) for pose in vertices]
+        )
         clip = source.write_clip(path, frames, latents, request)
-        unit = 1.0 / own.scale
+        unit = 1.0 / file_frame.scale
         return list(files), [WrittenPose(Path(path), stored, unit, notes) for stored, notes in clip]
     frame = export_frame(body, request.axes, path, request.scale)
     with ExitStack() as stack:

@@ -56,13 +56,13 @@ def finger_joints(
     joints: dict[Segment, int] = {}
     for (side, finger), chain in chains.items():
         # Rigify's controls lie beside the bones that deform.
-        own = [joint for joint in chain if plain[joint].startswith("def")] or chain
-        bones = [joint for joint in own if not _TIP.search(plain[joint])]
+        deforming = [joint for joint in chain if plain[joint].startswith("def")] or chain
+        bones = [joint for joint in deforming if not _TIP.search(plain[joint])]
         n_palm = sum(finger != "thumb" and bool(_PALM.search(plain[joint])) for joint in bones)
         while len(bones) > N_SEGMENTS + n_palm and bones[-1] not in above:
             bones.pop()
         n_palm = max(n_palm, len(bones) - N_SEGMENTS)
-        tips = [joint for joint in own if joint not in bones]
+        tips = [joint for joint in deforming if joint not in bones]
         numbered = [(place + 1 - n_palm, joint) for place, joint in enumerate(bones)]
         numbered += [(N_SEGMENTS + 1, joint) for joint in tips[:1]]
         joints |= {(side, finger, number): joint for number, joint in numbered if number >= 0}

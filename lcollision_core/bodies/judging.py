@@ -66,8 +66,8 @@ def judge_poses(
     ShapeError : wrong shape, or a number that is not finite.
     """
     codes = np.atleast_2d(np.asarray(latent, dtype=np.float64))
-    chosen = detector or model.detector
-    free, colliding = _sure_verdicts(model, codes, error_bound, chosen.clearance)
+    judging_detector = detector or model.detector
+    free, colliding = _sure_verdicts(model, codes, error_bound, judging_detector.clearance)
     exact = ~(free | colliding)
     verdict = colliding.copy()
     if exact.any():
@@ -75,10 +75,12 @@ def judge_poses(
         decode = model.block_decoder
 
         def look(start: int, stop: int) -> None:
-            some = colliding_on_gpu(chosen, model.space, model.card.height, rows[start:stop])
+            some = colliding_on_gpu(
+                judging_detector, model.space, model.card.height, rows[start:stop]
+            )
             if some is None:
                 vertices = decode(rows[start:stop]).astype(np.float32)
-                some = chosen.are_colliding(vertices, workers=1)
+                some = judging_detector.are_colliding(vertices, workers=1)
             collides[start:stop] = some
 
         block = block_size(len(rows), model.topology.n_faces, BLOCK_POSES)
@@ -160,13 +162,13 @@ def sample_poses(
     detector = model.detector.with_clearance(clearance)
     if colliding is None:
         return model.sample(n_poses, generator)
-    kept = np.empty((n_poses, model.latent_size))
+    samples = np.empty((n_poses, model.latent_size))
     n_kept = n_misses = 0
     while n_kept < n_poses:
         drawn = model.sample(_DRAWN_AT_ONCE, generator)
         verdicts = judge_poses(model, drawn, error_bound, detector)
         matching = drawn[verdicts.colliding == colliding][: n_poses - n_kept]
-        kept[n_kept : n_kept + len(matching)] = matching
+        samples[n_kept : n_kept + len(matching)] = matching
         n_kept += len(matching)
         n_misses = 0 if len(matching) else n_misses + _DRAWN_AT_ONCE
         if n_misses >= _MOST_MISSES:
@@ -175,7 +177,7 @@ def sample_poses(
                 f"none of {n_misses} poses in a row {kind}", "ask for other poses"
             )
         job.report(n_kept, n_poses)
-    return kept
+    return samples
 
 
 CLEARANCE = 1e-3
@@ -258,9 +260,12 @@ def _dragged(
     """Drag random patches of training poses to random places on the body."""
     from lcollision_core.posing import DragOptions, make_grip
 
-    known, used = model.known_poses, model.topology.used_vertices
+    known_poses, used = model.known_poses, model.topology.used_vertices
     drawn = [
-        (known[generator.integers(len(known))], *(int(generator.choice(used)) for _ in range(2)))
+        (
+            known_poses[generator.integers(len(known_poses))],
+            *(int(generator.choice(used)) for _ in range(2)),
+        )
         for _ in range(-(-n_poses // _DRAG_EVENTS))
     ]
     poses = np.empty((len(drawn), _DRAG_EVENTS, model.latent_size))
@@ -270,8 +275,8 @@ def _dragged(
 
     def drag(first: int, last: int) -> None:
         for number in range(first, last):
-            start, taken, aim = drawn[number]
-            dragger, grip = model.dragger(), make_grip(model.space, taken)
+            start, vertex, aim = drawn[number]
+            dragger, grip = model.dragger(), make_grip(model.space, vertex)
             vertices = model.decode(start, n_threads=1)
             begin, end = grip.position(vertices), vertices[aim]
             dragger.begin(start, grip, (), DragOptions(solid=False))
@@ -287,7 +292,7 @@ def _resolved(
     model: LearnedBody, n_poses: int, generator: np.random.Generator, job: Job
 ) -> FloatArray:
     """Resolve colliding samples, drawn in equal numbers from the box and as noisy blends."""
-    wanted = max(1, round(_RESOLVED_SHARE * n_poses))
+    n_wanted = max(1, round(_RESOLVED_SHARE * n_poses))
     drawn = np.concatenate(
         [
             model.sample(n_poses, generator),
@@ -295,10 +300,10 @@ def _resolved(
         ]
     )
     colliding = np.flatnonzero(judge_poses(model, drawn).colliding)
-    chosen = generator.permutation(colliding)[:wanted]
+    sample_numbers = generator.permutation(colliding)[:n_wanted]
     # Samples have no largest change.
     options = ResolveOptions(clearance=CLEARANCE, largest_change=None)
-    results = model.resolver.resolve_many(drawn[chosen], options, job=job)
+    results = model.resolver.resolve_many(drawn[sample_numbers], options, job=job)
     free = [result.latent for result in results if result.exactly_free]
     return np.stack(free) if free else np.empty((0, model.latent_size))
 
@@ -426,16 +431,16 @@ def places_of(body: Body, pairs: Iterable[FacePair]) -> dict[tuple[str, str], in
 
     The first of these kinds whose names differ is used, as for an arm and its bracer.
     """
-    own, parts, components = (body.groups_by_kind[kind] for kind in GROUP_KINDS)
+    file_groups, parts, components = (body.groups_by_kind[kind] for kind in GROUP_KINDS)
     names = []
-    for groups in (parts, own, components):
+    for groups in (parts, file_groups, components):
         name = np.full(body.topology.n_faces, "", dtype=object)
         for group in groups:
             name[group.faces] = group.name
         names.append(name)
     counts: Counter[tuple[str, str]] = Counter()
     for a, b in pairs:
-        known = [(name[a], name[b]) for name in names if name[a] and name[b]]
-        first, second = next((pair for pair in known if pair[0] != pair[1]), known[0])
+        named_pairs = [(name[a], name[b]) for name in names if name[a] and name[b]]
+        first, second = next((pair for pair in named_pairs if pair[0] != pair[1]), named_pairs[0])
         counts[min(first, second), max(first, second)] += 1
     return dict(counts.most_common())

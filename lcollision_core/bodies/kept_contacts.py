@@ -65,8 +65,8 @@ class Correspondence:
     def limbs(self) -> npt.NDArray[np.int64]:
         """(V,) the limb of each of the body's vertices: a joint of the skeleton, or the trunk."""
         space, partner = self.retargeting.space, self.retargeting.partner.tolist()
-        own = _limbs(space, partner, _trunk(space))
-        return own[_heaviest(space)]
+        limb_of_joint = _limbs(space, partner, _trunk(space))
+        return limb_of_joint[_heaviest(space)]
 
     @cached_property
     def image(self) -> npt.NDArray[np.int64]:
@@ -83,28 +83,33 @@ class Correspondence:
         followed = set(partner.tolist()) - {-1}
         of_trunk = {int(partner[joint]) for joint in trunk}
         numbers = [names.get(common_name(name), -1) for name in source.rig.joint_names]
-        known = [number if number in followed else -1 for number in numbers]
-        own_trunk = _trunk(source) | {at for at, number in enumerate(known) if number in of_trunk}
-        theirs = _limbs(source, known, own_trunk)[_heaviest(source)]
+        followed_numbers = [number if number in followed else -1 for number in numbers]
+        own_trunk = _trunk(source) | {
+            at for at, number in enumerate(followed_numbers) if number in of_trunk
+        }
+        theirs = _limbs(source, followed_numbers, own_trunk)[_heaviest(source)]
         image = np.full(len(theirs), -1, dtype=np.int64)
         between = axes_of(space.up, space.front) @ axes_of(source.up, source.front).T
         turns = _turns(source, self.source_motion, frame), _turns(space, self.motion, frame)
         for limb in np.unique(theirs).tolist():
-            inside, own = np.flatnonzero(theirs == limb), np.flatnonzero(self.limbs == limb)
-            if not len(own):
+            inside, own_vertices = (
+                np.flatnonzero(theirs == limb),
+                np.flatnonzero(self.limbs == limb),
+            )
+            if not len(own_vertices):
                 continue
-            first = _first(source, inside, limb), _first(space, own, limb)
+            first = _first(source, inside, limb), _first(space, own_vertices, limb)
             turned = between @ turns[0][first[0]], turns[1][first[1]]
             # In the frame's pose, limbs point the same way, whatever their rest poses.
             points = (
                 (source.rest_vertices[inside] - source.origins[first[0]]) @ turned[0].T,
-                (space.rest_vertices[own] - space.origins[first[1]]) @ turned[1].T,
+                (space.rest_vertices[own_vertices] - space.origins[first[1]]) @ turned[1].T,
             )
             places = []
             for side in points:
                 axis = turned[1] @ space.up if limb == _TRUNK else side.mean(axis=0)
                 places.append(_places(side, axis, space.front, space.up))
-            image[inside] = own[cKDTree(places[1]).query(places[0])[1]]
+            image[inside] = own_vertices[cKDTree(places[1]).query(places[0])[1]]
         return image
 
     @cached_property
@@ -116,8 +121,8 @@ class Correspondence:
         by_limb, middles = self._faces
         faces = by_limb[limb]
         away = np.linalg.norm(middles[faces] - middle, axis=1)
-        chosen: npt.NDArray[np.intp] = faces[away <= max(radius, float(away.min()))]
-        return chosen
+        patch_vertices: npt.NDArray[np.intp] = faces[away <= max(radius, float(away.min()))]
+        return patch_vertices
 
     @cached_property
     def _faces(self) -> tuple[dict[int, npt.NDArray[np.intp]], FloatArray]:
@@ -129,8 +134,10 @@ class Correspondence:
 
 def _trunk(space: RigPoseSpace) -> set[int]:
     """Return the joints of hips, spine and collar bones."""
-    own = {joint for joint, role in enumerate(space.roles) if role in (Role.SPINE, Role.SHOULDER)}
-    return own | {int(space.joint_of_code[0])}
+    trunk_joints = {
+        joint for joint, role in enumerate(space.roles) if role in (Role.SPINE, Role.SHOULDER)
+    }
+    return trunk_joints | {int(space.joint_of_code[0])}
 
 
 def _limbs(space: RigPoseSpace, known: Sequence[int], trunk: set[int]) -> npt.NDArray[np.int64]:
@@ -163,9 +170,9 @@ def _first(space: RigPoseSpace, vertices: npt.NDArray[np.intp], limb: int) -> in
 
 def _turns(space: RigPoseSpace, motion: Motion, frame: int) -> FloatArray:
     """Return the rotation of each joint from rest in a frame: (J, 3, 3)."""
-    own = motion.space(frame, space)
-    assert isinstance(own, RigPoseSpace)
-    moved = own.transforms(motion.codes[frame]) @ np.linalg.inv(space.rig.rest)
+    frame_space = motion.space(frame, space)
+    assert isinstance(frame_space, RigPoseSpace)
+    moved = frame_space.transforms(motion.codes[frame]) @ np.linalg.inv(space.rig.rest)
     left, _, right = np.linalg.svd(moved[:, :3, :3])
     turned: FloatArray = left @ right
     return turned
@@ -218,18 +225,18 @@ class _Samples:
         n_steps = np.minimum(np.ceil(sides / _SPACING), 99).astype(np.int64)
         owners, shares = list[npt.NDArray[np.intp]](), list[FloatArray]()
         for n in np.unique(np.maximum(n_steps, 1)).tolist():
-            own = np.flatnonzero(np.maximum(n_steps, 1) == n)
+            edges = np.flatnonzero(np.maximum(n_steps, 1) == n)
             a, b = (grid.ravel() for grid in np.meshgrid(np.arange(n), np.arange(n)))
             inside = a + b < n
             one = (np.column_stack([a, b])[inside] + 1.0 / 3.0) / n
             one = np.column_stack([1.0 - one.sum(axis=1), one])
-            owners.append(np.repeat(own, len(one)))
-            shares.append(np.tile(one, (len(own), 1)))
+            owners.append(np.repeat(edges, len(one)))
+            shares.append(np.tile(one, (len(edges), 1)))
         face, weights = np.concatenate(owners), np.concatenate(shares)
         part = space.vertex_domain[faces[face, weights.argmax(axis=1)]]
         cells = np.floor(_at(rest, faces, face, weights) / _SPACING).astype(np.int64)
-        _, kept = np.unique(np.column_stack([cells, part]), axis=0, return_index=True)
-        return cls(faces, rest, face[kept], weights[kept], part[kept])
+        _, first_of_cell = np.unique(np.column_stack([cells, part]), axis=0, return_index=True)
+        return cls(faces, rest, face[first_of_cell], weights[first_of_cell], part[first_of_cell])
 
     def touching(
         self, vertices: FloatArray, adjacent: set[tuple[int, int]]
@@ -268,9 +275,9 @@ class _Samples:
             for side in (0, 1):
                 corners = self.faces[both[:, side]]
                 middle = np.average(self.rest[corners].mean(axis=1), axis=0, weights=lacks)
-                own = np.unique(corners)
-                away = np.linalg.norm(self.rest[own] - middle, axis=1)
-                middles.append(int(own[away.argmin()]))
+                touching_corners = np.unique(corners)
+                away = np.linalg.norm(self.rest[touching_corners] - middle, axis=1)
+                middles.append(int(touching_corners[away.argmin()]))
             touching.append(((a, b), (middles[0], middles[1])))
         return touching
 
@@ -364,7 +371,7 @@ def contacts_of(
 
 def _frames_at(motion: Motion, frames: npt.NDArray[np.intp]) -> Motion:
     """Return a motion made of given frames of another."""
-    own, hidden = motion.space_at, motion.hidden
+    frame_space, hidden = motion.space_at, motion.hidden
     return replace(
         motion,
         times=np.arange(len(frames)) / motion.rate,
@@ -372,7 +379,9 @@ def _frames_at(motion: Motion, frames: npt.NDArray[np.intp]) -> Motion:
         placements=None
         if motion.placements is None
         else tuple(motion.placements[frame] for frame in frames.tolist()),
-        space_at=None if own is None else lambda time: own(float(frames[int(time)])),
+        space_at=None
+        if frame_space is None
+        else lambda time: frame_space(float(frames[int(time)])),
         hidden=None if hidden is None else lambda frame: hidden(int(frames[frame])),
         contacts=None,
     )
@@ -450,7 +459,7 @@ def _soles(
             images = both.image[inside]
             if (images < 0).any():
                 continue
-            own = both.retargeting.space.rest_vertices[images].mean(axis=0)
+            sole_centre = both.retargeting.space.rest_vertices[images].mean(axis=0)
             limb = int(both.limbs[images[0]])
             on_ground = low[:, inside].any(axis=1)
             means = level[:, inside].mean(axis=1)
@@ -461,5 +470,5 @@ def _soles(
             # One patch per part keeps it in place.
             still &= ~stood
             stood |= still
-            patch = both.patch(own, limb, _SOLE_PATCH)
+            patch = both.patch(sole_centre, limb, _SOLE_PATCH)
             yield source.domain_names[part], patch, on_ground, still

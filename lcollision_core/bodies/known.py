@@ -122,10 +122,10 @@ def find_character(fingerprint: str) -> ListedModel | None:
     """
     if not re.fullmatch("[0-9a-f]{16}", fingerprint):
         return None
-    known = _readable_character(fingerprint)
-    if known is None or not Path(known.file).is_file():
+    entry = _readable_character(fingerprint)
+    if entry is None or not Path(entry.file).is_file():
         return None
-    return ListedModel(Path(known.file).stem, Path(known.file), bundled=False)
+    return ListedModel(Path(entry.file).stem, Path(entry.file), bundled=False)
 
 
 def open_character(
@@ -154,13 +154,13 @@ def open_character(
         character = replace(character, clips={})
     model = RigBody.of(character if up is None else turned(character, up))
     try:
-        known = known_character(model.fingerprint) if up is None else None
-        if known is not None and known.up_axis is not None:
-            model = RigBody.of(turned(character, known.up_axis))
-            known = known_character(model.fingerprint)
-        known = known or known_character(model.fingerprint)
-        if known is not None and known.roles is not None:
-            model = model.with_roles(dict(known.roles))
+        entry = known_character(model.fingerprint) if up is None else None
+        if entry is not None and entry.up_axis is not None:
+            model = RigBody.of(turned(character, entry.up_axis))
+            entry = known_character(model.fingerprint)
+        entry = entry or known_character(model.fingerprint)
+        if entry is not None and entry.roles is not None:
+            model = model.with_roles(dict(entry.roles))
     except (ModelFileError, ShapeError):
         # Damaged, as `with_remembered` reports.
         pass
@@ -175,15 +175,15 @@ def with_remembered(model: RigBody) -> RigBody:
     Notes report them, or why they could not be applied.
     """
     try:
-        known = known_character(model.fingerprint)
-        if known is None:
+        entry = known_character(model.fingerprint)
+        if entry is None:
             return model
-        chosen = {name: getattr(known, name) for name in _PARTS}
-        chosen = {name: value for name, value in chosen.items() if value is not None}
-        changed = model.with_card(replace(model.card, **chosen)) if chosen else model
-        if known.rules is None:
+        remembered = {name: getattr(entry, name) for name in _PARTS}
+        remembered = {name: value for name, value in remembered.items() if value is not None}
+        changed = model.with_card(replace(model.card, **remembered)) if remembered else model
+        if entry.rules is None:
             return changed
-        return changed.with_rules(known.rules).noted(
+        return changed.with_rules(entry.rules).noted(
             "its contact rules are those that you chose for it"
         )
     except LCollisionError as error:
@@ -213,18 +213,20 @@ def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigBody, FloatArray] | No
     """
     suffix = path.suffix.lower()
     document = open_scene(path) if suffix in SCENE_SUFFIXES else None
-    own = None if document is None else read_own_file(document)
-    if own is not None:
-        return RigBody.of(own.character).with_roles(own.roles).with_rules(own.rules), own.vertices
+    own_file = None if document is None else read_own_file(document)
+    if own_file is not None:
+        return RigBody.of(own_file.character).with_roles(own_file.roles).with_rules(
+            own_file.rules
+        ), own_file.vertices
     if document is not None and document.has_skin:
         body = open_character(document, clips=False)
         if known_character(body.fingerprint) is not None and mesh.topology == body.topology:
             return body, mesh.vertices
     digest = _digest(mesh.topology)
     for file in sorted(user_characters_folder().glob("*.json")):
-        known = _readable_character(file.stem)
-        if known is not None and known.mesh == digest and Path(known.file).is_file():
-            body = open_character(known.file, clips=False)
+        entry = _readable_character(file.stem)
+        if entry is not None and entry.mesh == digest and Path(entry.file).is_file():
+            body = open_character(entry.file, clips=False)
             if body.topology == mesh.topology:
                 return body, mesh.vertices * _unit_of(mesh.vertices, body)
     return None
@@ -268,9 +270,9 @@ def remember_up(model: Body, up: int) -> None:
     """
     if model.character is None:
         return
-    own = RigBody.of(as_read(model.character))
-    chosen = None if up == own.up_axis else up
-    _change(own, lambda known: replace(known, up_axis=chosen))
+    read_body = RigBody.of(as_read(model.character))
+    chosen_axis = None if up == read_body.up_axis else up
+    _change(read_body, lambda known: replace(known, up_axis=chosen_axis))
 
 
 def remember_roles(model: Body, roles: Mapping[str, str | None]) -> None:
@@ -289,11 +291,11 @@ def remember_roles(model: Body, roles: Mapping[str, str | None]) -> None:
     """
     if not isinstance(model, RigBody):
         raise LCollisionError("has no joints", "open a rigged character", where=model.name)
-    chosen = {**model.space.rig.chosen, **roles}
-    roles_kept = {name: role for name, role in chosen.items() if role is not None}
-    changed, own = model.with_roles(roles_kept), model.with_roles({})
+    all_roles = {**model.space.rig.chosen, **roles}
+    roles_kept = {name: role for name, role in all_roles.items() if role is not None}
+    changed, unchanged = model.with_roles(roles_kept), model.with_roles({})
     pairs = tuple(roles_kept.items()) or None
-    _change(own, lambda known: replace(known, roles=pairs))
+    _change(unchanged, lambda known: replace(known, roles=pairs))
     if model.rules_are_chosen and known_character(changed.fingerprint) is None:
         _change(changed, lambda known: replace(known, rules=model.rules))
 
@@ -307,10 +309,11 @@ def remember_choices(model: Body) -> None:
     """
     if not isinstance(model, RigBody):
         return
-    own, card = model.own_card, model.card
-    chosen = {name: getattr(card, name) for name in ("rules", *_PARTS)}
+    own_card, card = model.own_card, model.card
+    choices = {name: getattr(card, name) for name in ("rules", *_PARTS)}
     changed: dict[str, Any] = {
-        name: None if getattr(own, name) == chosen[name] else chosen[name] for name in chosen
+        name: None if getattr(own_card, name) == choices[name] else choices[name]
+        for name in choices
     }
     _change(model, lambda known: replace(known, **changed))
 
@@ -327,8 +330,8 @@ def remember_offer_declined(model: Body) -> None:
 
 def is_offer_declined(model: Body) -> bool:
     """Return whether the user declined the rules proposed from a character's poses."""
-    known = None if model.character is None else _readable_character(model.fingerprint)
-    return known is not None and known.offer_declined is True
+    entry = None if model.character is None else _readable_character(model.fingerprint)
+    return entry is not None and entry.offer_declined is True
 
 
 def _change(model: Body, change: Callable[[KnownCharacter], KnownCharacter]) -> None:
@@ -347,8 +350,8 @@ def _change(model: Body, change: Callable[[KnownCharacter], KnownCharacter]) -> 
             known = replace(known, mesh=_digest(model.topology))
             if known == before:
                 return
-            chosen = {name: entry for name, entry in asdict(known).items() if entry is not None}
-            document = {"format": _FORMAT, "format_version": _VERSION, **chosen}
+            entries = {name: entry for name, entry in asdict(known).items() if entry is not None}
+            document = {"format": _FORMAT, "format_version": _VERSION, **entries}
             with atomic_write(path) as file:
                 file.write(json.dumps(document, indent=1).encode() + b"\n")
     except (OSError, MeshFileError) as error:

@@ -112,8 +112,8 @@ def checked_mesh(
             "move it nearer to the origin",
         )
     mesh = mesh * scale
-    lengths, known = (topology.edge_lengths(pose) for pose in (mesh, reference))
-    size, limit = scale_of(lengths, known), LARGEST_SIZE
+    lengths, reference_lengths = (topology.edge_lengths(pose) for pose in (mesh, reference))
+    size, limit = scale_of(lengths, reference_lengths), LARGEST_SIZE
     if size is None:
         # Not scaled uniformly: perhaps not a pose, but only a large ratio indicates another unit.
         size, limit = body_size(mesh, topology) / body_size(reference, topology), _MOST_SIZE
@@ -126,7 +126,7 @@ def checked_mesh(
             raise PoseSetError(sentence, "export it again")
         factor = likely_factor(1.0 / size) * scale
         raise WrongScaleError(sentence, f"scale it by {factor:.6g}", factor=factor)
-    if is_torn(lengths, size * known):
+    if is_torn(lengths, size * reference_lengths):
         raise PoseSetError(
             f"the edges of the mesh join other vertices than those of {model!r}, as if in "
             "another order",
@@ -435,8 +435,8 @@ class PoseMirror:
         image = self.symmetry.image(self.check.decode(latent)[0] * size) / size
         mirrored = self._codes_of_image(latent, image, job)
         other = self.partner(domain)
-        own = self.check.space.codes_of([] if other is None else [other])
-        return np.where(own, mirrored, latent)
+        other_codes = self.check.space.codes_of([] if other is None else [other])
+        return np.where(other_codes, mirrored, latent)
 
 
 def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int) -> Symmetry | None:
@@ -659,18 +659,18 @@ def _between(space: RigPoseSpace, partner: npt.NDArray[np.intp], normal: FloatAr
             continue
         ends = np.flatnonzero(parents == joint)
         ends = ends[(partner[ends] >= 0) & (parents[partner[ends]] == other)]
-        own = (space.origins[ends] - space.origins[joint]).sum(axis=0)
+        mean_bone = (space.origins[ends] - space.origins[joint]).sum(axis=0)
         image = flip @ (space.origins[partner[ends]] - space.origins[other]).sum(axis=0)
-        lengths = np.linalg.norm(own) * np.linalg.norm(image)
+        lengths = np.linalg.norm(mean_bone) * np.linalg.norm(image)
         parent = int(parents[joint])
         if lengths <= _NEARER**2:
             # The end of a limb takes its parent's rotation.
             between[joint] = between[parent] if parent >= 0 else np.eye(3)
-        elif np.arccos(np.clip(own @ image / lengths, -1.0, 1.0)) > _ALIKE:
-            axis = np.cross(image, own)
+        elif np.arccos(np.clip(mean_bone @ image / lengths, -1.0, 1.0)) > _ALIKE:
+            axis = np.cross(image, mean_bone)
             sine = float(np.linalg.norm(axis))
             if sine > _NEARER * lengths:
-                angle = np.arctan2(sine, image @ own)
+                angle = np.arctan2(sine, image @ mean_bone)
                 between[joint] = Rotation.from_rotvec(angle * axis / sine).as_matrix()
     return between
 

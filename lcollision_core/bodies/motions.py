@@ -115,9 +115,11 @@ def _misfits(body: RigBody, motion: SmplMotion) -> list[str]:
     model = body.character.smpl
     assert model is not None
     name, notes = model.path.name, []
-    own = next((gender for gender in _GENDERS if gender in model.path.stem.lower()), "")
-    if own and motion.gender in _GENDERS and motion.gender != own:
-        notes.append(f"it was made for a {motion.gender} body ('gender'), and {name} is {own}")
+    named_gender = next((gender for gender in _GENDERS if gender in model.path.stem.lower()), "")
+    if named_gender and motion.gender in _GENDERS and motion.gender != named_gender:
+        notes.append(
+            f"it was made for a {motion.gender} body ('gender'), and {name} is {named_gender}"
+        )
     kind = _KINDS[len(model.names)]
     if motion.body_model in _KINDS.values() and motion.body_model != kind:
         made_for, ours = motion.body_model.upper(), kind.upper()
@@ -178,10 +180,12 @@ def write_smpl(
     turns, places = motion.turns[list(frames)], motion.places[list(frames)]
     pelvis = space.rig.rest[0, :3, 3]
     for row, pose in enumerate(codes):
-        own, shift = space.turns_of(pose)
-        own[0] = (Rotation.from_matrix(frame.T) * Rotation.from_rotvec(own[0])).as_rotvec()
+        own_turns, shift = space.turns_of(pose)
+        own_turns[0] = (
+            Rotation.from_matrix(frame.T) * Rotation.from_rotvec(own_turns[0])
+        ).as_rotvec()
         for joint, number in _pairs(space, motion):
-            turns[row, number] = own[joint]
+            turns[row, number] = own_turns[joint]
         places[row] = (pelvis + shift) @ frame - pelvis
     with atomic_write(path) as out:
         motion.write(out, frames, turns, places)
@@ -203,13 +207,13 @@ def _shaped(body: RigBody, motion: SmplMotion) -> Character | None:
     character = body.character
     assert character.smpl is not None
     shaped, rig = character_of_smpl(character.smpl, motion.betas, motion.names), body.space.rig
-    own = shaped.rig
-    assert own is not None
-    turns_same = np.array_equal(np.asarray(own.moving), np.asarray(rig.moving))
-    if turns_same and np.abs(own.rest - rig.rest).max() <= _SAME_REST:
+    rig_in_shape = shaped.rig
+    assert rig_in_shape is not None
+    turns_same = np.array_equal(np.asarray(rig_in_shape.moving), np.asarray(rig.moving))
+    if turns_same and np.abs(rig_in_shape.rest - rig.rest).max() <= _SAME_REST:
         return None
-    chosen = replace(own, chosen=rig.chosen)
-    return replace(shaped, rig=chosen, up=character.up, up_is_sure=character.up_is_sure)
+    shaped_rig = replace(rig_in_shape, chosen=rig.chosen)
+    return replace(shaped, rig=shaped_rig, up=character.up, up_is_sure=character.up_is_sure)
 
 
 def _pairs(space: RigPoseSpace, motion: SmplMotion) -> list[tuple[int, int]]:
@@ -290,11 +294,11 @@ def read_motions(
     )
     if not names:
         raise MeshFileError("has no animation", "export it with its clips", where=path)
-    chosen = list(names) if clip is None else [clip]
+    clip_names = list(names) if clip is None else [clip]
     if character is not None and body.joints is not None:
-        return [_of_clip(character, body.joints, name, fps) for name in chosen]
+        return [_of_clip(character, body.joints, name, fps) for name in clip_names]
     motions = []
-    for name in chosen:
+    for name in clip_names:
         rate = fps or frame_rate(path, name) or NOMINAL_RATE
         topology = body.topology
         poses = read_pose_set(path, job.part(), clip=name, fps=rate, topology=topology)
@@ -322,8 +326,8 @@ def _contacts(
             return None
         if source.character is None or source.joints is None:
             return None
-        own = _of_clip(source.character, source.joints, motion.name, fps)
-        return contacts_of(body, motion, source, own, retargeting)
+        source_motion = _of_clip(source.character, source.joints, motion.name, fps)
+        return contacts_of(body, motion, source, source_motion, retargeting)
 
     return found
 
@@ -481,7 +485,7 @@ def motion_of_transforms(
     )
     if not points and not shown and all(is_held):
         return Motion(name, times, codes, None, None, source)
-    own = space.own_joints(codes, transforms)
+    moved_joints = space.own_joints(codes, transforms)
     n_kept = max(2, _MOST_BYTES // (24 * int(np.count_nonzero(space.rig.weights))))
 
     @lru_cache(n_kept)
@@ -491,7 +495,7 @@ def motion_of_transforms(
     @lru_cache(n_kept)
     def body(frame: int) -> RigPoseSpace:
         shaped = shape(points[frame]) if frame in points else None
-        own_space = space.with_own(own.offsets[frame], own.linear[frame], shaped)
+        own_space = space.with_own(moved_joints.offsets[frame], moved_joints.linear[frame], shaped)
         if frame not in shown:
             return own_space
         vertices = shown[frame]().astype(np.float64)
@@ -645,9 +649,9 @@ def write_new_clips(
 
 def _joints(motion: Motion, frame: int, space: RigPoseSpace) -> FloatArray:
     """Return the (J, 4, 4) global transforms of the joints in a frame of a motion."""
-    own = motion.space(frame, space)
-    assert isinstance(own, RigPoseSpace)
-    return own.transforms(motion.codes[frame])
+    frame_space = motion.space(frame, space)
+    assert isinstance(frame_space, RigPoseSpace)
+    return frame_space.transforms(motion.codes[frame])
 
 
 @dataclass(frozen=True, eq=False)
@@ -715,8 +719,8 @@ class _ClipsOfFile:
         for span in change.spans:
             both = (self._shown(before, span, version) for version in (was, data))
             for frame, (old, new) in zip(span, zip(*both, strict=True), strict=True):
-                seen = before.seen(self.check, range(frame, frame + 1))
-                if is_worse(seen, old, new, change.largest_change):
+                frame_vertices = before.seen(self.check, range(frame, frame + 1))
+                if is_worse(frame_vertices, old, new, change.largest_change):
                     worse.append(span)
                     break
         return worse
@@ -729,11 +733,11 @@ class _ClipsOfFile:
         place = np.eye(4)
         place[:3, :3], place[:3, 3] = back.scale * back.rotation, back.translation
         # Parts hidden at rest may have become joints.
-        made = self.made.character.rig
-        assert made is not None
+        file_rig = self.made.character.rig
+        assert file_rig is not None
         assert character.rig is not None
         numbers = {node: joint for joint, node in enumerate(character.rig.nodes.tolist())}
-        nodes = made.nodes[np.argsort(self.made.joints)].tolist()
+        nodes = file_rig.nodes[np.argsort(self.made.joints)].tolist()
         joints = [numbers[node] for node in nodes]
         free = []
         for change in changes:
@@ -741,13 +745,15 @@ class _ClipsOfFile:
             frames = character.sample(name, times)
             assert frames.transforms is not None
             # The rig as read may store influences, or parts hidden at rest, differently.
-            shown = {frame: partial(self._moved_back, frames, frame) for frame in frames.points}
+            vertices_of_frame = {
+                frame: partial(self._moved_back, frames, frame) for frame in frames.points
+            }
             motion = motion_of_transforms(
                 self.space,
                 name,
                 change.before.times,
                 place @ frames.transforms[:, joints],
-                shown=shown,
+                shown=vertices_of_frame,
                 shapes=self._numbers(character, frames),
             )
             verdicts = (
@@ -760,10 +766,10 @@ class _ClipsOfFile:
     def _numbers(self, character: Character, frames: ClipFrames) -> FloatArray | None:
         """Return shape codes of the file's frames in the body's order."""
         assert character.rig is not None
-        read, own = character.rig.shapes, self.space.rig.shapes
-        if read is None or own is None or frames.shapes is None:
+        read, slider_shapes = character.rig.shapes, self.space.rig.shapes
+        if read is None or slider_shapes is None or frames.shapes is None:
             return None
-        return frames.shapes[:, [read.names.index(name) for name in own.names]]
+        return frames.shapes[:, [read.names.index(name) for name in slider_shapes.names]]
 
     def _moved_back(self, frames: ClipFrames, frame: int) -> FloatArray:
         return self.made.frame.inverse().apply(frames.vertices[frame][self.made.to_read])

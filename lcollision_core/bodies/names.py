@@ -222,7 +222,7 @@ def code_effects(
     weights = np.asarray(attention_mask, dtype=np.float64) ** 2
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), _TINY)
     domains = np.arange(len(weights))
-    own = np.concatenate([domains, np.repeat(domains, group_sizes[1:])])
+    domain_of_code = np.concatenate([domains, np.repeat(domains, group_sizes[1:])])
     positions = decode(np.zeros((1, len(high))))[0]
     effects: list[CodeEffect] = []
     for start in range(0, len(high), _CHUNK):
@@ -232,7 +232,12 @@ def code_effects(
         moved = decode(poses) - positions
         effects.extend(
             _effect(
-                motion, positions, weights, axes, own[code], _OWN if code >= len(domains) else 0.0
+                motion,
+                positions,
+                weights,
+                axes,
+                domain_of_code[code],
+                _OWN if code >= len(domains) else 0.0,
             )
             for code, motion in zip(codes, moved, strict=True)
         )
@@ -389,10 +394,10 @@ def domain_colours(attention_mask: npt.NDArray[Any]) -> tuple[str, ...]:
     from scipy.optimize import quadratic_assignment
 
     n_domains = len(attention_mask)
-    chosen = [PALETTE[domain % len(PALETTE)] for domain in range(n_domains)]
+    colours = [PALETTE[domain % len(PALETTE)] for domain in range(n_domains)]
     if n_domains > _MOST_ARRANGED:
-        return tuple(chosen)
-    chroma = np.array([cielab(colour)[1:] for colour in chosen])
+        return tuple(colours)
+    chroma = np.array([cielab(colour)[1:] for colour in colours])
     squared_distance = ((chroma[:, None] - chroma) ** 2).sum(axis=2)
     likeness = 1.0 / (squared_distance + 25.0)
     mask = np.asarray(attention_mask, dtype=np.float64)
@@ -409,7 +414,7 @@ def domain_colours(attention_mask: npt.NDArray[Any]) -> tuple[str, ...]:
             "rng": np.random.default_rng(0),
         },
     )
-    return tuple(chosen[colour] for colour in assignment.col_ind)
+    return tuple(colours[colour] for colour in assignment.col_ind)
 
 
 def cielab(colour: str, sight: npt.NDArray[np.float64] | None = None) -> npt.NDArray[np.float64]:

@@ -89,7 +89,7 @@ def partners(
             partner[joint] = -1
     if len(followed_limbs(partner, space)) < LEAST_JOINTS:
         partner[:] = -1
-    taken = set(partner.tolist())
+    taken_joints = set(partner.tolist())
     own_sides = _sides(anatomy.roles, anatomy.sides, motion.parents)
     in_limb = set(next_in_limb(space.rig, space.roles).values())
     for role in (*_ONE_EACH, Role.SPINE):
@@ -101,7 +101,7 @@ def partners(
             if role is Role.SPINE:
                 at = np.linspace(0, len(theirs) - 1, len(ours)).round().astype(int)
                 partner[ours] = np.array(theirs)[at]
-            elif theirs[0] not in taken:
+            elif theirs[0] not in taken_joints:
                 # Not an IK target, which may have the same name.
                 partner[min(ours, key=lambda joint: joint not in in_limb)] = theirs[0]
     # The first joint of a finger lies in the palm in some skeletons only.
@@ -199,25 +199,27 @@ def chosen_for(motion: SkeletonMotion, space: RigPoseSpace, path: Path) -> Follo
     ------
     MeshFileError : a choice names an unknown joint.
     """
-    chosen = space.rig.followed
-    if not chosen:
+    chosen_partners = space.rig.followed
+    if not chosen_partners:
         try:
             return read_followed(_path(motion.names, space.rig.joint_names)).joints
         except (OSError, ModelFileError):
             return {}
-    for kind, known, named in (
-        ("body", space.rig.joint_names, chosen),
-        ("motion", motion.names, filter(None, chosen.values())),
+    for kind, names_of_both, named in (
+        ("body", space.rig.joint_names, chosen_partners),
+        ("motion", motion.names, filter(None, chosen_partners.values())),
     ):
-        unknown = next((name for name in named if name not in known), None)
+        unknown = next((name for name in named if name not in names_of_both), None)
         if unknown is not None:
-            listed = ", ".join(known[:6]) + (" and others" if len(known) > 6 else "")
+            listed = ", ".join(names_of_both[:6]) + (
+                " and others" if len(names_of_both) > 6 else ""
+            )
             raise MeshFileError(
                 f"is to move by --joints, and the {kind} has no joint {unknown!r}",
                 f"its joints are {listed}",
                 where=path,
             )
-    return chosen
+    return chosen_partners
 
 
 def read_followed(path: str | os.PathLike[str]) -> _Chosen:
@@ -249,10 +251,10 @@ def following(body: Body, file: str | os.PathLike[str]) -> RigBody:
         what = "is no character with joints, which --joints is for"
         raise LCollisionError(what, "name one rigged character", where=body.name)
     try:
-        chosen = read_followed(file).joints
+        chosen_partners = read_followed(file).joints
     except FileNotFoundError as error:
         raise ModelFileError("there is no such file", "check the name", where=file) from error
-    rig = replace(body.space.rig, followed=chosen)
+    rig = replace(body.space.rig, followed=chosen_partners)
     return RigBody.of(replace(body.character, rig=rig)).with_choices_of(body)
 
 
@@ -283,8 +285,10 @@ def _path(theirs: Sequence[str], ours: Sequence[str]) -> Path:
 
 def named_alike(motion: SkeletonMotion, space: RigPoseSpace) -> npt.NDArray[np.int64]:
     """Return, for each joint of the rig, the first skeleton joint of that name, -1 for none."""
-    own = {common_name(name): joint for joint, name in reversed(list(enumerate(motion.names)))}
-    return np.array([own.get(common_name(name), -1) for name in space.rig.joint_names])
+    joint_by_name = {
+        common_name(name): joint for joint, name in reversed(list(enumerate(motion.names)))
+    }
+    return np.array([joint_by_name.get(common_name(name), -1) for name in space.rig.joint_names])
 
 
 def followed_limbs(partner: npt.NDArray[np.int64], space: RigPoseSpace) -> list[int]:
@@ -297,12 +301,12 @@ def _sides(
     roles: Sequence[Role], sides: Sequence[Side], parents: npt.NDArray[np.integer]
 ) -> list[Side]:
     """Return the sides of joints; a collar bone in the middle takes the side of its arm."""
-    own = list(sides)
-    for joint in range(len(own) - 1, 0, -1):
+    joint_sides = list(sides)
+    for joint in range(len(joint_sides) - 1, 0, -1):
         parent = int(parents[joint])
-        if parent >= 0 and roles[parent] is Role.SHOULDER and own[parent] is Side.MIDDLE:
-            own[parent] = own[joint]
-    return own
+        if parent >= 0 and roles[parent] is Role.SHOULDER and joint_sides[parent] is Side.MIDDLE:
+            joint_sides[parent] = joint_sides[joint]
+    return joint_sides
 
 
 def common_name(name: str) -> str:

@@ -326,10 +326,10 @@ def _other_model(
         str(owner.get(key))[:MAX_POSE_NAME_LENGTH] for key in ("fingerprint", "name")
     )
     listed, character = find_latent_space(fingerprint, name), find_character(fingerprint)
-    known = listed or character
-    if known is not None and known.name == model.name:
-        what = f"contains poses of another {name!r}, {known.path}: {_difference(owner, model)}"
-        next_step = f"use them with {known.path}"
+    other_name = listed or character
+    if other_name is not None and other_name.name == model.name:
+        what = f"contains poses of another {name!r}, {other_name.path}: {_difference(owner, model)}"
+        next_step = f"use them with {other_name.path}"
     elif listed is not None:
         what = f"contains poses of the model {listed.name!r}, not of {model.name!r}"
         next_step = f"use them with {listed.name!r}"
@@ -348,7 +348,7 @@ def _other_model(
             "among your models"
         )
         next_step = f"copy its file to {user_models_folder()}, or name it"
-    return OtherModelError(what, next_step, where=path, model=known)
+    return OtherModelError(what, next_step, where=path, model=other_name)
 
 
 def _measures(model: Body) -> dict[str, int]:
@@ -359,13 +359,13 @@ def _measures(model: Body) -> dict[str, int]:
 
 def _difference(owner: dict[str, Any], model: Body) -> str:
     """Describe how a file's model differs from another model of the same name."""
-    said = [
+    differences = [
         f"{owner[what]} {what} instead of {number}"
         for what, number in _measures(model).items()
         if type(owner.get(what)) is int and owner[what] != number
     ]
-    if said:
-        return f"it has {', '.join(said)}"
+    if differences:
+        return f"it has {', '.join(differences)}"
     alike = "has as many vertices, but" if "vertices" in owner else "is another export:"
     if model.joints is not None:
         return f"it {alike} its joints differ in rest position, axes or skin weights"
@@ -491,9 +491,9 @@ def _stored_latent(
     latent: npt.NDArray[np.float64], model: Body
 ) -> tuple[list[float], dict[str, float]]:
     """Return the codes without shapes, and the nonzero shapes by name."""
-    own = model.shape_codes
-    named = zip(model.shape_names, latent[own].tolist(), strict=True)
-    return latent[: own.start].tolist(), {name: number for name, number in named if number}
+    shape_codes = model.shape_codes
+    named = zip(model.shape_names, latent[shape_codes].tolist(), strict=True)
+    return latent[: shape_codes.start].tolist(), {name: number for name, number in named if number}
 
 
 def _latent(stored: _StoredPose | _StoredSource, model: Body) -> npt.NDArray[np.float64]:

@@ -133,8 +133,8 @@ class Retargeting:
             below = next_bone.get(joint, joint)
             if role in ALIGNED and min(partner[[joint, below]]) >= 0:
                 way = frame @ (rest[partner[below]] - rest[partner[joint]])
-                own = aligned[joint] @ (joints[below] - joints[joint])
-                aligned[joint] = least_turn(own, way) @ aligned[joint]
+                bone = aligned[joint] @ (joints[below] - joints[joint])
+                aligned[joint] = least_turn(bone, way) @ aligned[joint]
         share = np.array(
             [
                 np.count_nonzero(partner[: joint + 1] == own) / np.count_nonzero(partner == own)
@@ -192,9 +192,9 @@ class Retargeting:
         turns : (n, J, 3, 3) rotations of the skeleton's joints relative to their parents
         roots : (n, 3) positions of its root
         """
-        chosen = list(frames)
+        frame_numbers = list(frames)
         turns, _ = in_world(self.motion)
-        old_turns, local = turns[chosen], self.motion.turns()[chosen]
+        old_turns, local = turns[frame_numbers], self.motion.turns()[frame_numbers]
         rest = np.linalg.inv(self.space.rig.rest)
         difference = (after @ rest)[..., :3, :3] @ np.linalg.inv((before @ rest)[..., :3, :3])
         # If several joints follow one, the last carries its children.
@@ -208,7 +208,7 @@ class Retargeting:
                 local[:, joint] = np.swapaxes(above, -2, -1) @ new_turns[:, joint]
             else:
                 new_turns[:, joint] = above @ local[:, joint]
-        roots: FloatArray = self.motion.places()[chosen, 0]
+        roots: FloatArray = self.motion.places()[frame_numbers, 0]
         if self._hips >= 0:
             roots += (after - before)[:, self._hips, :3, 3] @ self.frame / self.scale
         return self.motion.turns_as_stored(local), roots
@@ -216,8 +216,10 @@ class Retargeting:
     def _rest_of(self, joint: int) -> FloatArray:
         """Return the position of a skeleton joint when the character is at rest."""
         if self.is_same_rig:
-            own: FloatArray = self.space.rig.rest[self._hips, :3, 3] @ self.frame / self.scale
-            return own
+            joint_rest: FloatArray = (
+                self.space.rig.rest[self._hips, :3, 3] @ self.frame / self.scale
+            )
+            return joint_rest
         rest = rest_places(self.motion)
         up = self.frame.T @ self.space.up
         if rest[0] @ up <= 0.0:
@@ -237,11 +239,11 @@ def _followed(
     ----------
     rest : (J, 3) positions of its joints
     """
-    chosen = chosen_for(motion, space, path)
-    figure = as_chosen(stick_figure(motion, rest, motion.up), chosen, space)
+    chosen_partners = chosen_for(motion, space, path)
+    figure = as_chosen(stick_figure(motion, rest, motion.up), chosen_partners, space)
     anatomy = _facing(anatomy_of(figure), motion.front)
-    partner = partners(motion, anatomy, space, chosen)
-    unsure = frozenset() if chosen else unsure_joints(partner, figure, anatomy, space)
+    partner = partners(motion, anatomy, space, chosen_partners)
+    unsure = frozenset() if chosen_partners else unsure_joints(partner, figure, anatomy, space)
     return figure, anatomy, partner, unsure
 
 
@@ -294,16 +296,16 @@ def _as_the_rig(motion: NodeMotion, space: RigPoseSpace) -> RestedMotion | None:
         other, above = int(partner[joint]), int(partner[parent])
         if parent < 0 or min(other, above) < 0 or motion.parents[other] != above:
             continue
-        own = axes[parent].T @ (places[joint] - places[parent])
+        bone = axes[parent].T @ (places[joint] - places[parent])
         theirs = motion.axes[above].T @ motion.offsets[other]
-        lengths = np.linalg.norm(own), np.linalg.norm(theirs)
+        lengths = np.linalg.norm(bone), np.linalg.norm(theirs)
         if lengths[0] < _SHORT_BONE * size or lengths[1] < _SHORT:
             continue
-        cosine = float(own @ theirs / (lengths[0] * lengths[1]))
+        cosine = float(bone @ theirs / (lengths[0] * lengths[1]))
         if space.roles[parent] in ALIGNED and in_limb.get(parent) == joint:
             turned = axes[parent].T @ axes[joint] @ motion.axes[other].T @ motion.axes[above]
             is_hinge = space.roles[joint] in (Role.FOREARM, Role.SHIN)
-            if cosine < _SAME_BONE or (is_hinge and _twist(turned, own) < _TWISTED):
+            if cosine < _SAME_BONE or (is_hinge and _twist(turned, bone) < _TWISTED):
                 return None
         cosines.append(cosine)
     if not cosines or np.mean(np.array(cosines) > _ALIKE) < _MOST_ALIKE:
@@ -458,8 +460,8 @@ def bvh_of(space: RigPoseSpace, transforms: FloatArray, frame_time: float) -> by
             np.concatenate([still, moved.turns], axis=1),
             np.concatenate([np.zeros((len(transforms), 1, 3)), moved.places], axis=1),
         )
-    seen = moved.seen_from(parents.tolist())
-    return bvh_bytes(names, parents, moved.rest, ends, *seen, frame_time)
+    from_parents = moved.seen_from(parents.tolist())
+    return bvh_bytes(names, parents, moved.rest, ends, *from_parents, frame_time)
 
 
 def held_by_bvh(space: RigPoseSpace, bvh: Bvh) -> FloatArray:
@@ -518,10 +520,10 @@ def vrma_of(
     moved = _Moved.of(space, transforms)
     parents = _parents(space.rig, joints)
     aligned, stood = _t_pose(space, bones, moved.rest, parents, is_avatar)
-    chosen = _Moved(
+    exported = _Moved(
         stood, moved.turns[:, joints] @ np.swapaxes(aligned, 1, 2), moved.places[:, joints]
     )
-    turns, places = chosen.seen_from(parents)
+    turns, places = exported.seen_from(parents)
     ground = np.array([0.0, float((character.rest_vertices @ space.up).min()), 0.0])
     metres = character.metres
     offsets = np.where(np.array(parents)[:, None] >= 0, stood - stood[parents], stood - ground)
@@ -543,14 +545,18 @@ def _bones(character: Character, space: RigPoseSpace) -> tuple[bool, dict[str, i
     """Return whether the file names its VRM bones, and the joint of each bone, parents first."""
     rig, bones = space.rig, dict[str, int]()
     if is_gltf(character) and character.file is not None:
-        said, nodes = human_bones(character.file.document), rig.nodes.tolist()
-        known = {node: bone for node, bone in said.items() if not bone.endswith("Eye")}
-        bones = {known[node]: joint for joint, node in enumerate(nodes) if node in known}
+        bones_of_file, nodes = human_bones(character.file.document), rig.nodes.tolist()
+        bone_of_node = {
+            node: bone for node, bone in bones_of_file.items() if not bone.endswith("Eye")
+        }
+        bones = {
+            bone_of_node[node]: joint for joint, node in enumerate(nodes) if node in bone_of_node
+        }
         # VRM 0 names the joints of a thumb one further along.
         for side in ("left", "right"):
             if f"{side}ThumbIntermediate" in bones:
-                own = [bones.pop(f"{side}Thumb{name}", None) for name in _PHALANGES[Role.FINGER]]
-                named = zip(_PHALANGES[Role.THUMB], own, strict=True)
+                thumb = [bones.pop(f"{side}Thumb{name}", None) for name in _PHALANGES[Role.FINGER]]
+                named = zip(_PHALANGES[Role.THUMB], thumb, strict=True)
                 bones |= {f"{side}Thumb{name}": joint for name, joint in named if joint is not None}
     is_avatar = bool(bones)
     if not is_avatar:
@@ -574,9 +580,11 @@ def _recognised(space: RigPoseSpace) -> dict[str, int]:
     for side in (Side.LEFT, Side.RIGHT):
         for role, name in _LIMBS.items():
             if (role, side) in kinds:
-                own = [joint for joint, kind in enumerate(kinds) if kind == (role, side)]
+                matching = [joint for joint, kind in enumerate(kinds) if kind == (role, side)]
                 # Not an IK target, which may have the same name.
-                joints[f"{side.value}{name}"] = min(own, key=lambda joint: joint not in in_limb)
+                joints[f"{side.value}{name}"] = min(
+                    matching, key=lambda joint: joint not in in_limb
+                )
     fingers = finger_joints(rig.joint_names, rig.parents, roles, sides)
     for (side, finger, number), joint in fingers.items():
         if side is not Side.MIDDLE and 1 <= number <= N_SEGMENTS:
@@ -651,10 +659,10 @@ def _t_pose(
         if role not in (Role.FOOT, Role.SHOULDER, Role.SPINE):
             turned[bone] = turned[parent]
         if role in (Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN) and joint in next_bone:
-            own = turned[bone] @ (rest[next_bone[joint]] - rest[joint])
+            bone_way = turned[bone] @ (rest[next_bone[joint]] - rest[joint])
             is_arm = role in (Role.UPPER_ARM, Role.FOREARM)
             way = (across if side is Side.LEFT else -across) if is_arm else down
-            turned[bone] = least_turn(own, way) @ turned[bone]
+            turned[bone] = least_turn(bone_way, way) @ turned[bone]
     return turned, places
 
 
@@ -810,18 +818,18 @@ def write_skeleton(
         out.write(data)
     if is_bvh:
         # Any rig can read back its own BVH file; retargeting might not match it.
-        kept = held_by_bvh(body.space, read_bvh(path))
+        latents_in_file = held_by_bvh(body.space, read_bvh(path))
     else:
         ((back, _),) = carried_motions(body, Path(path), fps=fps)
         codes = back.codes
-        kept = np.array([body.space.transforms(row) for row in codes])
+        latents_in_file = np.array([body.space.transforms(row) for row in codes])
     space, size = body.space, body.body_size
 
     def stored(frame: int) -> npt.NDArray[Any]:
-        return (space.skinned(kept[frame]) * size).astype(np.float32)
+        return (space.skinned(latents_in_file[frame]) * size).astype(np.float32)
 
     # Lazily: all frames at once may not fit in memory.
-    pairs = zip(range(len(kept)), vertices, strict=True)
+    pairs = zip(range(len(latents_in_file)), vertices, strict=True)
     off = max(float(np.abs(stored(frame) - shown).max()) for frame, shown in pairs) / size
     notes: tuple[str, ...] = ()
     if off > _SAME:

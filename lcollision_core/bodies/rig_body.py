@@ -106,22 +106,22 @@ def fit_rig(
     if not in_place:
         rotation, translation = fit_rigid(vertices[used], space.rest_vertices[used])
     aligned: FloatArray = vertices @ rotation.T + translation
-    chosen = used[:: max(1, len(used) // _FITTED_VERTICES)]
+    sample = used[:: max(1, len(used) // _FITTED_VERTICES)]
     starts = [space.codes_of_transforms(_turned_joints(space, aligned)), np.zeros_like(space.low)]
-    missing = [aligned[chosen] - space.decode(codes[None])[0, chosen] for codes in starts]
+    missing = [aligned[sample] - space.decode(codes[None])[0, sample] for codes in starts]
     codes, missing_now = min(
         zip(starts, missing, strict=True), key=lambda one: float((one[1] ** 2).sum())
     )
     damping = _DAMPING
     for _ in range(_FIT_STEPS):
         job.check()
-        by_codes = space.tangents(codes, chosen).reshape(len(codes), -1)
+        by_codes = space.tangents(codes, sample).reshape(len(codes), -1)
         # Faces are ambiguous, so shapes stay at rest.
         by_codes[space.are_shapes] = 0.0
         normal = by_codes @ by_codes.T
         normal[np.diag_indices_from(normal)] += damping * np.trace(normal) / len(normal)
         tried = codes + np.linalg.solve(normal, by_codes @ missing_now.ravel())
-        left = aligned[chosen] - space.decode(tried[None])[0, chosen]
+        left = aligned[sample] - space.decode(tried[None])[0, sample]
         before, after = float((missing_now**2).sum()), float((left**2).sum())
         if after >= before:
             damping *= 10.0
@@ -174,10 +174,10 @@ def motion_names(space: RigPoseSpace) -> list[str]:
         for code, joint in enumerate(joints.tolist(), start):
             motion = _motion(space, code)
             if several:
-                own = [word for word in words[joint] if word not in _words(part)]
-                if own and not any(map(str.isalpha, own)):
-                    own.insert(0, "joint")
-                motion = " ".join((*own, motion))
+                joint_words = [word for word in words[joint] if word not in _words(part)]
+                if joint_words and not any(map(str.isalpha, joint_words)):
+                    joint_words.insert(0, "joint")
+                motion = " ".join((*joint_words, motion))
             names.append(motion)
     return names
 
@@ -317,10 +317,10 @@ def joint_groups(character: Character) -> tuple[FaceGroup, ...]:
     linked = [joint for joint in faces_of if parents[joint] >= 0]
     for joint in linked:
         children = [child for child in linked if parents[child] == joint]
-        own, above, centre = faces_of[joint], parents[joint], centres[joint]
-        end = centres[children].mean(axis=0) if children else middles[own].mean(axis=0)
+        joint_faces, above, centre = faces_of[joint], parents[joint], centres[joint]
+        end = centres[children].mean(axis=0) if children else middles[joint_faces].mean(axis=0)
         radius = min(
-            _radius(middles[own] - centre, end - centre),
+            _radius(middles[joint_faces] - centre, end - centre),
             _radius(middles[faces_of[above]] - centre, centres[above] - centre),
         )
         thickness[joint] = min(2.0 * radius, _MOST_THICK * size)
@@ -469,11 +469,11 @@ class RigBody(Body):
         printable = ("".join(filter(str.isprintable, name)) for name in space.part_names)
         parts_of_faces = part_groups(character.topology, joint_parts(character, space.anatomy))
         groups = (*character.groups, *parts_of_faces, *joint_groups(character))
-        shown = [name.strip()[:MAX_NAME_LENGTH] or "part" for name in printable]
+        domain_names = [name.strip()[:MAX_NAME_LENGTH] or "part" for name in printable]
         card = ModelCard(
             height=space.body_size,
             up_axis=int(np.abs(character.up).argmax()),
-            domain_names=tuple(unique_names(shown, MAX_NAME_LENGTH)),
+            domain_names=tuple(unique_names(domain_names, MAX_NAME_LENGTH)),
             domain_colours=domain_colours(space.attention_mask),
             pose_names=tuple(name[:MAX_POSE_NAME_LENGTH] for name in names[: len(poses)]),
             source=character.source.name,
@@ -514,13 +514,13 @@ class RigBody(Body):
             names, colours = others_card.domain_names, others_card.domain_colours
             card = replace(card, domain_names=names, domain_colours=colours)
             card = replace(card, domain_order=others_card.domain_order)
-        chosen = self.with_card(card)
+        body = self.with_card(card)
         if others_card.rules != card.rules:
-            chosen = chosen.with_rules(others_card.rules)
+            body = body.with_rules(others_card.rules)
         touching = other.detector.may_touch
         if not touching:
-            return chosen
-        return chosen._with_detector(chosen.card, chosen.detector.with_touching(touching))
+            return body
+        return body._with_detector(body.card, body.detector.with_touching(touching))
 
     @property
     def own_rules(self) -> ContactRules:
@@ -792,7 +792,7 @@ def poses_by_rig(
     generator = np.random.default_rng(seed)
     extents = draws.extents(n_poses, generator)
     tried = np.zeros((len(_DRAWS), n_poses, body.latent_size))
-    chosen = np.zeros(n_poses, dtype=np.int64)
+    best_try = np.zeros(n_poses, dtype=np.int64)
     waiting = np.arange(n_poses)
     for number, size in enumerate(_DRAWS):
         tried[number, waiting] = size * extents[waiting] * draws.codes(len(waiting), generator)
@@ -804,7 +804,7 @@ def poses_by_rig(
             colliding[some] = body.detector.are_colliding(vertices, job=job.part())
             n_free = int((~colliding).sum())
             job.report(n_poses - len(waiting) + n_free, n_poses)
-        chosen[waiting] = number
+        best_try[waiting] = number
         waiting = waiting[colliding]
     for start in range(0, len(waiting), _AT_ONCE // _FULL):
         group = waiting[start : start + _AT_ONCE // _FULL]
@@ -813,9 +813,9 @@ def poses_by_rig(
         )
         collisions = body.detector.detect_batch(vertices, counted_only=True, job=job.part())
         energy = collisions.vertex_energy.sum(axis=1)
-        chosen[group] = energy.reshape(_FULL, -1).argmin(axis=0)
+        best_try[group] = energy.reshape(_FULL, -1).argmin(axis=0)
         job.report(n_poses - len(waiting) + start + len(group), n_poses)
-    codes = tried[chosen, np.arange(n_poses)]
+    codes = tried[best_try, np.arange(n_poses)]
     provenance = {
         "seed": seed,
         "drawn": n_poses,

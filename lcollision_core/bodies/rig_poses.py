@@ -247,15 +247,15 @@ class _Body:
 
     def _turns(self, pose: _Pose) -> FloatArray:
         """Return the (J, 3, 3) rotations from rest of all joints, about left, up and front."""
-        own: dict[int, FloatArray] = {}
+        joint_turns: dict[int, FloatArray] = {}
         for side in _SIDES:
-            own |= self._leg(self._limbs[Role.THIGH, side], pose.legs[_SIDES.index(side)])
-        turns, places = self._carried(pose, own)
+            joint_turns |= self._leg(self._limbs[Role.THIGH, side], pose.legs[_SIDES.index(side)])
+        turns, places = self._carried(pose, joint_turns)
         for side in _SIDES:
             upper = self._limbs[Role.UPPER_ARM, side]
             chest = turns[self._space.rig.parents[upper]]
-            own |= self._arm(upper, pose.arms[_SIDES.index(side)], chest, places)
-        return self._carried(pose, own)[0]
+            joint_turns |= self._arm(upper, pose.arms[_SIDES.index(side)], chest, places)
+        return self._carried(pose, joint_turns)[0]
 
     def _carried(self, pose: _Pose, own: Mapping[int, FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Return all joints' turns and positions, given the turns of some joints."""
@@ -338,8 +338,10 @@ class _Body:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the turns of an arm's two bones that bring its wrist to a target."""
         fore = self._next[upper]
-        own, hinge, end = (self._places[segment] for segment in (upper, fore, self._next[fore]))
-        a, b = float(np.linalg.norm(hinge - own)), float(np.linalg.norm(end - hinge))
+        shoulder, hinge, end = (
+            self._places[segment] for segment in (upper, fore, self._next[fore])
+        )
+        a, b = float(np.linalg.norm(hinge - shoulder)), float(np.linalg.norm(end - hinge))
         way = target - start
         length = float(np.clip(np.linalg.norm(way), abs(a - b) * 1.01, (a + b) * 0.999))
         way /= np.linalg.norm(way)
@@ -389,10 +391,10 @@ class _Body:
     def _thickness(self, joint: int, bone: int, place: FloatArray | None = None) -> float:
         """Return the skin's radius about a joint, across a bone's direction, at a place."""
         way = self._bones[bone][:, 1]
-        own = self._points[self._heaviest == joint] - (
+        limb_points = self._points[self._heaviest == joint] - (
             self._places[joint] if place is None else place
         )
-        near = own[np.abs(own @ way) < _NEAR]
+        near = limb_points[np.abs(limb_points @ way) < _NEAR]
         across = np.linalg.norm(near - (near @ way)[:, None] * way, axis=1)
         return float(np.median(across)) if len(near) else _NEAR
 
@@ -544,8 +546,8 @@ class HumanDraws:
                 limits[joint, 2] = -limits[joint, 2, ::-1]
         reached = np.zeros_like(limits)
         place = space.joint_of_code[ROOT_CODES:], space.axis_of_code[ROOT_CODES:]
-        own = slice(ROOT_CODES, len(space.joint_of_code))
-        low, high = space.low[own, None], space.high[own, None]
+        joint_codes = slice(ROOT_CODES, len(space.joint_of_code))
+        low, high = space.low[joint_codes, None], space.high[joint_codes, None]
         reached[place] = np.clip(limits[place], low, high)
         return reached
 

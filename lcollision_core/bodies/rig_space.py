@@ -334,8 +334,8 @@ class RigPoseSpace:
     def _plausible(self) -> FloatArray:
         """(n, D) codes of the rest pose and of some frames, or else of moderate random poses."""
         if len(self.frame_codes):
-            chosen = np.linspace(0, len(self.frame_codes) - 1, _METRIC_POSES - 1).astype(int)
-            others = self.frame_codes[np.unique(chosen)]
+            pose_numbers = np.linspace(0, len(self.frame_codes) - 1, _METRIC_POSES - 1).astype(int)
+            others = self.frame_codes[np.unique(pose_numbers)]
         else:
             others = 0.5 * self._random(_METRIC_POSES - 1)
         return np.concatenate([np.zeros((1, len(self.low))), others])
@@ -353,17 +353,17 @@ class RigPoseSpace:
         if self._origin is not None:
             return self._origin.domain_metrics
         every = max(1, self.topology.n_vertices // _METRIC_VERTICES)
-        chosen = self.topology.used_vertices[::every].astype(np.int64)
-        led = self.vertex_domain[chosen]
+        sample = self.topology.used_vertices[::every].astype(np.int64)
+        led = self.vertex_domain[sample]
         moving = [np.flatnonzero(codes) for codes in self._codes_that_move_parts()]
         blocks = [np.zeros((len(codes), len(codes))) for codes in moving]
         for pose in self._plausible:
-            moved = self.tangents(pose, chosen)
+            moved = self.tangents(pose, sample)
             for domain, (codes, block) in enumerate(zip(moving, blocks, strict=True)):
                 by_code = moved[np.ix_(codes, led == domain)].reshape(len(codes), -1)
                 block += by_code @ by_code.T
         for block in blocks:
-            block /= len(self._plausible) * len(chosen)
+            block /= len(self._plausible) * len(sample)
         return DisplacementMetrics(len(self.low), moving, blocks)
 
     def _codes_that_move_parts(self) -> npt.NDArray[np.bool_]:
@@ -405,11 +405,11 @@ class RigPoseSpace:
         """
         if self._origin is not None:
             at_rest = np.zeros(len(self.low))
-            own, plain = (
+            own_lengths, plain = (
                 self.topology.edge_lengths(space.decode(at_rest[None])[0])
                 for space in (self, self._origin)
             )
-            return self._origin.longest_edges + np.maximum(own - plain, 0.0)
+            return self._origin.longest_edges + np.maximum(own_lengths - plain, 0.0)
         extremes = np.concatenate([np.diag(self.low), np.diag(self.high)])
         longest = self.topology.edge_lengths(self.rest_vertices)
         for codes in np.concatenate([extremes, self._random(_STRETCH_POSES), self._plausible]):
@@ -426,11 +426,11 @@ class RigPoseSpace:
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return a (D,) mask of body parts' codes; the root's part owns those of the whole body."""
-        chosen = list(domains)
+        domain_list = list(domains)
         owner = np.repeat(np.arange(-1, self.n_domains), self.group_sizes)
         owned = np.zeros(len(self.low), dtype=np.bool_)
-        owned[: len(owner)] = np.isin(owner, chosen)
-        owned[:ROOT_CODES] = self._root_part in chosen
+        owned[: len(owner)] = np.isin(owner, domain_list)
+        owned[:ROOT_CODES] = self._root_part in domain_list
         return owned
 
     def codes_of_joints(self, joints: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
@@ -567,9 +567,9 @@ class RigPoseSpace:
         starts = np.flatnonzero(is_first).tolist()
         for start, end in pairwise([*starts, len(poses)]):
             influences = self._influences_of(chosen, poses[start])
-            own, shaped = slice(start, end), self._shaped(poses[start], influences, chosen)
-            skin: tuple[Any, ...] = (*self._joint_frames, *shaped, vertices[own])
-            rig_kernels.skin_poses(turns[own], shifts[own], *skin)
+            block, shaped = slice(start, end), self._shaped(poses[start], influences, chosen)
+            skin: tuple[Any, ...] = (*self._joint_frames, *shaped, vertices[block])
+            rig_kernels.skin_poses(turns[block], shifts[block], *skin)
         return vertices
 
     def gpu_decoder(self, body_size: float) -> PosesOnGpu | None:
@@ -607,11 +607,11 @@ class RigPoseSpace:
             return np.zeros((len(by_vertices), 0))
         used = np.flatnonzero(by_vertices.any(axis=(0, 2)))
         first, rows = self._rows_of(chosen[used])
-        held = by_vertices[:, np.repeat(used, np.diff(first))]
-        by_points = np.einsum("nma,mab->nmb", held, linear[self._joints[rows]])
+        columns = by_vertices[:, np.repeat(used, np.diff(first))]
+        by_points = np.einsum("nma,mab->nmb", columns, linear[self._joints[rows]])
         by_points *= self._weights[rows, None] / self.body_size
         deltas = self.rig.shapes.by_row[(3 * rows[:, None] + np.arange(3)).ravel()]
-        by_shapes: FloatArray = (deltas.T @ by_points.reshape(len(held), 3 * len(rows)).T).T
+        by_shapes: FloatArray = (deltas.T @ by_points.reshape(len(columns), 3 * len(rows)).T).T
         return by_shapes
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
@@ -686,17 +686,17 @@ class RigPoseSpace:
         weights : (m, V) of the patches' means
         """
         # Only the vertices of the patches count.
-        chosen = np.unique(weights.indices)
-        means = weights[:, chosen].toarray()[:, None, :, None] * np.eye(3)[:, None]
-        means = means.reshape(-1, len(chosen), 3)
-        influences = self._influences_of(chosen, np.zeros(len(self.low)))
+        used_vertices = np.unique(weights.indices)
+        means = weights[:, used_vertices].toarray()[:, None, :, None] * np.eye(3)[:, None]
+        means = means.reshape(-1, len(used_vertices), 3)
+        influences = self._influences_of(used_vertices, np.zeros(len(self.low)))
 
         def slopes(codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
             bent = np.array(codes, dtype=np.float64)
             bent[self._hinges] = np.maximum(bent[self._hinges], _LEAST_BEND)
-            own = self._pulled_back(bent, means, chosen.astype(np.int64), influences)
+            pulled = self._pulled_back(bent, means, used_vertices.astype(np.int64), influences)
             others = self._pulled_back(codes, by_vertices, self._everyone)
-            return np.concatenate([own, others])
+            return np.concatenate([pulled, others])
 
         return slopes
 
@@ -740,22 +740,22 @@ class RigPoseSpace:
         poses = given.reshape(-1, self.n_joints, 4, 4)
         moved = poses @ np.linalg.inv(self.rig.rest)
         numbers = np.zeros((len(poses), 3 + 3 * len(self._bones)))
-        kept = np.zeros(numbers.shape[1], dtype=np.bool_)
-        kept[self._place] = True
+        is_held = np.zeros(numbers.shape[1], dtype=np.bool_)
+        is_held[self._place] = True
         linear = np.empty((len(poses), len(self._bones), 3, 3))
         for bone, joint in enumerate(self._bones.tolist()):
             parent, axes = self._parents[bone], self._bone_axes[bone]
             before = axes if parent < 0 else linear[:, parent] @ axes
             # A virtual root does not move.
-            wanted = moved[:, joint, :3, :3] if joint >= 0 else np.eye(3)[None]
+            parent_axes = moved[:, joint, :3, :3] if joint >= 0 else np.eye(3)[None]
             if joint >= 0 and parent >= 0:
                 # A joint hidden by its scale follows its parent.
-                is_hidden = np.linalg.norm(wanted, axis=1).min(axis=1) < _HIDDEN
-                wanted = np.where(is_hidden[:, None, None], linear[:, parent], wanted)
-            local = _nearest_rotations(np.linalg.inv(before) @ wanted @ axes)
+                is_hidden = np.linalg.norm(parent_axes, axis=1).min(axis=1) < _HIDDEN
+                parent_axes = np.where(is_hidden[:, None, None], linear[:, parent], parent_axes)
+            local = _nearest_rotations(np.linalg.inv(before) @ parent_axes @ axes)
             places = slice(3 + 3 * bone, 6 + 3 * bone)
             numbers[:, places] = np.where(
-                kept[places], Rotation.from_matrix(local).as_rotvec(), 0.0
+                is_held[places], Rotation.from_matrix(local).as_rotvec(), 0.0
             )
             turned = Rotation.from_rotvec(numbers[:, places]).as_matrix()
             linear[:, bone] = before @ turned @ self._bone_inverses[bone]
@@ -779,8 +779,8 @@ class RigPoseSpace:
         """
         numbers = np.empty((len(turns), 3 + 3 * len(self._bones)))
         numbers[:, :3] = shifts @ self._body / self.body_size
-        own = np.einsum("bxi,nbx->nbi", self._bone_axes, turns[:, self._bones])
-        numbers[:, 3:] = own.reshape(len(turns), -1)
+        angles = np.einsum("bxi,nbx->nbi", self._bone_axes, turns[:, self._bones])
+        numbers[:, 3:] = angles.reshape(len(turns), -1)
         return self._by_codes(numbers)
 
     def turns_of(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -799,10 +799,12 @@ class RigPoseSpace:
         joints = self.joint_of_code[_SHIFTS:]
         turned = [_SHIFTS + np.flatnonzero(joints == joint) for joint in np.unique(joints)]
         free = [codes_of_one for codes_of_one in turned if len(codes_of_one) == 3]
-        own = np.array(free, dtype=np.int64).reshape(-1, 3)
+        free_codes = np.array(free, dtype=np.int64).reshape(-1, 3)
         unwound = codes.copy()
         for at in range(1, len(codes)):
-            unwound[at, own] = nearest_winding(unwound[at, own], unwound[at - 1, own])
+            unwound[at, free_codes] = nearest_winding(
+                unwound[at, free_codes], unwound[at - 1, free_codes]
+            )
         return unwound
 
     def holding(
@@ -931,9 +933,9 @@ class RigPoseSpace:
         gram = np.add.reduceat(squared, self._first[:-1]) + _TINY * np.eye(3)
         missing = np.linalg.solve(gram, (vertices - self.decode(codes[None])[0])[:, :, None])
         missing = np.repeat(missing, np.diff(self._first), axis=0)
-        own = np.swapaxes(linear, 1, 2)[self._joints] @ missing
+        rest_offsets = np.swapaxes(linear, 1, 2)[self._joints] @ missing
         other = self._copy()
-        other._points = np.ascontiguousarray(self._points + own[:, :, 0])
+        other._points = np.ascontiguousarray(self._points + rest_offsets[:, :, 0])
         return other
 
     def skinned(self, transforms: npt.ArrayLike) -> FloatArray:

@@ -76,13 +76,13 @@ def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
         version = document.get("format_version")
         if isinstance(version, int) and version > _VERSION:
             raise ModelFileError.too_new(target, quoted(version), _VERSION)
-        said = from_json(SceneFile, document, "the scene")
+        scene = from_json(SceneFile, document, "the scene")
     except FileNotFoundError as error:
         raise ModelFileError.unreadable(target, "there is no such file", "name a scene") from error
     except (OSError, ValueError) as error:
         raise ModelFileError.unreadable(target, error, "save the scene again") from error
-    parts = tuple(replace(part, file=_found(part, target)) for part in said.bodies)
-    return replace(said, bodies=parts, path=str(target))
+    parts = tuple(replace(part, file=_found(part, target)) for part in scene.bodies)
+    return replace(scene, bodies=parts, path=str(target))
 
 
 def _found(part: ScenePart, scene: Path) -> str:
@@ -109,20 +109,20 @@ def write_scene_file(path: str | os.PathLike[str], scene: SceneFile) -> None:
     folder = Path(path).absolute().parent
     bodies = []
     for part in scene.bodies:
-        kept: dict[str, Any] = {"file": part.file}
+        stored: dict[str, Any] = {"file": part.file}
         if len(Path(part.file).parts) > 1 or Path(part.file).suffix:
             absolute = Path(part.file).absolute()
             try:
-                kept["file"] = Path(os.path.relpath(absolute, folder)).as_posix()
+                stored["file"] = Path(os.path.relpath(absolute, folder)).as_posix()
             except ValueError:  # On another drive.
-                kept["file"] = absolute.as_posix()
+                stored["file"] = absolute.as_posix()
         default = ScenePart("")
-        kept |= {
+        stored |= {
             name: value
             for name, value in vars(part).items()
             if name != "file" and value != getattr(default, name)
         }
-        bodies.append(kept)
+        bodies.append(stored)
     document = {
         "format": SCENE_FORMAT,
         "format_version": _VERSION,
@@ -152,8 +152,8 @@ def body_of_scene(
     ------
     LCollisionError : a file cannot be read, or a holder or its joint is unknown.
     """
-    known = [*opened, *[None] * (len(scene.bodies) - len(opened))]
-    pairs = list(zip(scene.bodies, known, strict=True))
+    known_bodies = [*opened, *[None] * (len(scene.bodies) - len(opened))]
+    pairs = list(zip(scene.bodies, known_bodies, strict=True))
     bodies = [body or open_member(part.file) for part, body in pairs]
     names = unique_names(part.name or Path(part.file).stem for part in scene.bodies)
     first = bodies[0]
@@ -169,11 +169,13 @@ def body_of_scene(
     path = Path(scene.path)
     # Scenes not named by the user get their name from their bodies.
     is_named = scene.path and not re.search(r" [0-9a-f]{8}$", path.stem)
-    made = SceneBody(members, path.stem if is_named else "", scene)
+    scene_body = SceneBody(members, path.stem if is_named else "", scene)
     uncounted = [name for part, name in zip(scene.bodies, names, strict=True) if not part.counts]
     if not uncounted:
-        return made
-    return made.with_rules(replace(made.rules, left_out=(*made.rules.left_out, *uncounted)))
+        return scene_body
+    return scene_body.with_rules(
+        replace(scene_body.rules, left_out=(*scene_body.rules.left_out, *uncounted))
+    )
 
 
 def beside(scene: SceneFile, file: Path) -> SceneFile:
@@ -239,11 +241,13 @@ def joint_named(body: Body, name: str) -> int:
     assert body.joints is not None
     names = body.joints.rig.joint_names
     plain = [joint.rsplit(":", 1)[-1].lower() for joint in names]
-    for given, known in ((name, list(names)), (name.rsplit(":", 1)[-1].lower(), plain)):
-        if given in known:
-            return known.index(given)
-    shown = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
-    raise LCollisionError(f"has no joint {name!r}", f"its joints are {shown}", where=body.name)
+    for given, names_known in ((name, list(names)), (name.rsplit(":", 1)[-1].lower(), plain)):
+        if given in names_known:
+            return names_known.index(given)
+    first_names = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
+    raise LCollisionError(
+        f"has no joint {name!r}", f"its joints are {first_names}", where=body.name
+    )
 
 
 def _ground(height: float | str, members: Sequence[SceneMember]) -> SceneMember:

@@ -122,8 +122,8 @@ class PlacedSpace:
 
     def turned_back(self, ways: FloatArray) -> FloatArray:
         """Turn derivatives by (..., 3) scene coordinates into those by the body's own."""
-        own: FloatArray = self.place.scale * (ways @ self.place.rotation)
-        return own
+        vectors: FloatArray = self.place.scale * (ways @ self.place.rotation)
+        return vectors
 
 
 class SceneSpace:
@@ -172,8 +172,8 @@ class SceneSpace:
         starts_of = [0, sum(firsts), sum(self.group_sizes)]
         for space, n_first in zip(spaces, firsts, strict=True):
             sizes_of = n_first, sum(space.group_sizes[1:]), space.n_shapes
-            own = [np.arange(n) + at for at, n in zip(starts_of, sizes_of, strict=True)]
-            self.codes.append(np.concatenate(own))
+            code_ranges = [np.arange(n) + at for at, n in zip(starts_of, sizes_of, strict=True)]
+            self.codes.append(np.concatenate(code_ranges))
             starts_of = [at + n for at, n in zip(starts_of, sizes_of, strict=True)]
         self.n_shapes = sum(space.n_shapes for space in spaces)
         self.low, self.high = (
@@ -216,8 +216,8 @@ class SceneSpace:
 
     def of(self, codes: FloatArray, member: int) -> FloatArray:
         """Return one member's (..., D_k) of (..., D) codes."""
-        own: FloatArray = codes[..., self.codes[member]]
-        return own
+        weights: FloatArray = codes[..., self.codes[member]]
+        return weights
 
     @cached_property
     def attention_mask(self) -> npt.NDArray[np.float32]:
@@ -231,9 +231,9 @@ class SceneSpace:
         """The members' metrics; each member has equal weight, whatever its vertex count."""
         codes: list[_Indices] = []
         blocks: list[FloatArray] = []
-        for member, own, _ in self._each():
+        for member, space, _ in self._each():
             metrics, weight = member.space.domain_metrics, member.place.scale**2
-            codes += [own[part] for part in metrics.codes]
+            codes += [space[part] for part in metrics.codes]
             blocks += [weight / len(self.members) * block for block in metrics.blocks]
         return DisplacementMetrics(len(self.low), codes, blocks)
 
@@ -253,8 +253,8 @@ class SceneSpace:
         longest = np.empty(len(self.topology.edges))
         of_edge = self.topology.edges[:, 0]
         for member, _, rows in self._each():
-            own = np.flatnonzero((of_edge >= rows.start) & (of_edge < rows.stop))
-            longest[own] = member.place.scale * member.space.longest_edges
+            member_edges = np.flatnonzero((of_edge >= rows.start) & (of_edge < rows.stop))
+            longest[member_edges] = member.place.scale * member.space.longest_edges
         return longest
 
     @cached_property
@@ -265,10 +265,10 @@ class SceneSpace:
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return a (D,) mask of body parts' codes; all of a body's codes if all parts are given."""
-        chosen = set(domains)
+        wanted_domains = set(domains)
         owned = np.zeros(len(self.low), dtype=np.bool_)
         for (member, own, _), parts in zip(self._each(), self.domains, strict=True):
-            inside = [part - parts.start for part in parts if part in chosen]
+            inside = [part - parts.start for part in parts if part in wanted_domains]
             owned[own] = member.space.codes_of(inside) | (len(inside) == len(parts))
         return owned
 
@@ -279,8 +279,8 @@ class SceneSpace:
         scales = [member.place.scale for member in self.members]
         starts = np.cumsum([0, *(len(tree.parents) for tree in trees)])[:-1].tolist()
         owner = np.zeros(len(self.low), dtype=np.int64)
-        for tree, own, at in zip(trees, self.codes, starts, strict=True):
-            owner[own] = np.where(tree.owner >= 0, tree.owner + at, -1)
+        for tree, member_codes, at in zip(trees, self.codes, starts, strict=True):
+            owner[member_codes] = np.where(tree.owner >= 0, tree.owner + at, -1)
         return Limbs(
             parents=np.concatenate(
                 [
@@ -305,8 +305,8 @@ class SceneSpace:
         prices, start = [], 0
         for number, member in enumerate(self.members):
             n_segments = len(member.space.limbs.parents)
-            own = {part - start for part in held if start <= part < start + n_segments}
-            prices.append(member.space.price(self.of(moved, number), own, whole_body))
+            fixed_segments = {part - start for part in held if start <= part < start + n_segments}
+            prices.append(member.space.price(self.of(moved, number), fixed_segments, whole_body))
             start += n_segments
         return self._matrix(prices)
 

@@ -270,14 +270,14 @@ class Skeleton:
 
     def _head_chain(self, arms: _Pair, up: FloatArray) -> list[int]:
         """Return the joints of neck and head, which continue the trunk between the arms."""
-        taken = {chain[0] for chain in arms.chains}
+        arm_roots = {chain[0] for chain in arms.chains}
         best: list[int] = []
         for child in self._children[arms.trunk]:
             way = self._places[child] - arms.middle
             aside = abs(way @ _unit(arms.across)) > 0.2 * np.linalg.norm(arms.across)
             top = (self._places[list(self.below(child))] @ up).max()
             rises = top > self._places[arms.trunk] @ up
-            if child not in taken and not aside and rises:
+            if child not in arm_roots and not aside and rises:
                 best = max(best, self._chain(child), key=lambda one: self._shares[one[:1]].sum())
         return best
 
@@ -545,9 +545,9 @@ def joint_sides(rig: Rig, left: FloatArray) -> list[Side]:
     places = (places - np.median(places)) / float(np.ptp(rig.rest[:, :3, 3], axis=0).max() or 1.0)
     sides: list[Side] = []
     for parent, place in zip(rig.parents.tolist(), places, strict=True):
-        own = Side.LEFT if place > _MIDDLE else Side.RIGHT if place < -_MIDDLE else Side.MIDDLE
+        side = Side.LEFT if place > _MIDDLE else Side.RIGHT if place < -_MIDDLE else Side.MIDDLE
         above = sides[parent] if parent >= 0 else Side.MIDDLE
-        sides.append(own if above is Side.MIDDLE else above)
+        sides.append(side if above is Side.MIDDLE else above)
     return sides
 
 
@@ -753,13 +753,15 @@ def anatomy_of(character: Character) -> Anatomy:
     LCollisionError : the character has no rig.
     """
     rig, up = rig_of(character), character.up
-    chosen = {rig.joint_names.index(name): ROLE_NAMES[role] for name, role in rig.chosen.items()}
+    chosen_roles = {
+        rig.joint_names.index(name): ROLE_NAMES[role] for name, role in rig.chosen.items()
+    }
     parts = list(part_names(rig.joint_names))
     lefts = [
         -1 if part.startswith("Right ") else int(part.startswith("Left "))
         for part in (part or "" for part in parts)
     ]
-    for joint, (_, side) in chosen.items():
+    for joint, (_, side) in chosen_roles.items():
         lefts[joint] = {Side.LEFT: 1, Side.RIGHT: -1, Side.MIDDLE: 0}[side]
     named = list(joint_roles(rig))
     _rename_ends(rig, parts)
@@ -770,7 +772,7 @@ def anatomy_of(character: Character) -> Anatomy:
         if person is not None and joint in person.roles:
             parts[joint] = None
     roles, by_name = _merged(named, person, skeleton)
-    for joint, (role, _) in chosen.items():
+    for joint, (role, _) in chosen_roles.items():
         roles[joint] = role
     directions = bone_directions(rig, rig.rest[:, :3, 3], roles)
     front = front_of(roles, rig.rest[:, :3, 3], directions, up)
@@ -786,7 +788,7 @@ def anatomy_of(character: Character) -> Anatomy:
         front = front_direction(character.rest_vertices * up[upwards], upwards) * up[upwards]
     if animal is not None:
         roles = [
-            Role.OTHER if role in _LIMBS and joint not in chosen else role
+            Role.OTHER if role in _LIMBS and joint not in chosen_roles else role
             for joint, role in enumerate(roles)
         ]
         notes.append(_FOUR_LEGS)
@@ -800,16 +802,19 @@ def anatomy_of(character: Character) -> Anatomy:
     sides = joint_sides(rig, np.cross(own_up, own_front))
     for joint, left in enumerate(lefts):
         # Without a trunk in the middle, names are more reliable than positions.
-        if left and (person is None or joint in chosen):
+        if left and (person is None or joint in chosen_roles):
             sides[joint] = Side.LEFT if left > 0 else Side.RIGHT
-    known = [
-        part if trusted and joint not in chosen else None
+    trusted_parts = [
+        part if trusted and joint not in chosen_roles else None
         for joint, (part, trusted) in enumerate(zip(parts, by_name, strict=True))
     ]
     labels = joint_labels(
         rig.joint_names,
         rig.parents,
-        [part or _part(role, side) for part, role, side in zip(known, roles, sides, strict=True)],
+        [
+            part or _part(role, side)
+            for part, role, side in zip(trusted_parts, roles, sides, strict=True)
+        ],
     )
     return Anatomy(tuple(roles), tuple(sides), labels, front, axes, tuple(notes))
 
@@ -925,8 +930,8 @@ def joint_parts(character: Character, anatomy: Anatomy | None = None) -> npt.NDA
     ------
     LCollisionError : the character has no rig.
     """
-    known, rig = anatomy or anatomy_of(character), rig_of(character)
-    return part_labels(known.labels, rig.joint_of, rig.weights)
+    joint_anatomy, rig = anatomy or anatomy_of(character), rig_of(character)
+    return part_labels(joint_anatomy.labels, rig.joint_of, rig.weights)
 
 
 def rig_of(character: Character) -> Rig:

@@ -80,8 +80,8 @@ def skeleton_of_smpl(motion: SmplMotion) -> NodeMotion:
     parents = np.array([index.get(ways[name][0], -1) for name in order], dtype=np.int64)
     offsets = np.array([ways[name][1] for name in order])
     frame, n_frames = axes_of_smpl(motion), len(motion)
-    chosen = motion.turns[:, [numbers[name] for name in order]]
-    turns = Rotation.from_rotvec(chosen.reshape(-1, 3)).as_matrix()
+    joint_turns = motion.turns[:, [numbers[name] for name in order]]
+    turns = Rotation.from_rotvec(joint_turns.reshape(-1, 3)).as_matrix()
     turns = turns.reshape(n_frames, len(order), 3, 3)
     turns[:, 0] = frame @ turns[:, 0]
     places = np.tile(offsets, (n_frames, 1, 1))

@@ -199,14 +199,14 @@ class HalfMesh:
 
     def arrays(self) -> tuple[FloatArray, IntArray, npt.NDArray[np.bool_]]:
         """Return the remaining vertices (V, 3), faces (F, 3) and rim mask (V,)."""
-        kept = np.flatnonzero(self._alive)
+        alive_faces = np.flatnonzero(self._alive)
         index = np.full(len(self._alive), -1, dtype=np.int32)
-        index[kept] = np.arange(len(kept), dtype=np.int32)
-        faces = sorted({face for u in kept for face in self._faces_of[u]})
+        index[alive_faces] = np.arange(len(alive_faces), dtype=np.int32)
+        faces = sorted({face for u in alive_faces for face in self._faces_of[u]})
         return (
-            np.array([self._position[u] for u in kept]),
+            np.array([self._position[u] for u in alive_faces]),
             index[np.array(faces)],
-            np.array([self._on_rim[u] for u in kept]),
+            np.array([self._on_rim[u] for u in alive_faces]),
         )
 
     def _push(self, queue: list[tuple[float, int, int, int, int]], u: int, v: int) -> None:
@@ -523,8 +523,8 @@ def _gather_fingers(
     for side in "LR":
         aim = _direction(heads, 3, side)
         for finger in (2, 4, 5):
-            own = _direction(heads, finger, side)
-            axis = np.cross(own, aim)
+            finger_direction = _direction(heads, finger, side)
+            axis = np.cross(finger_direction, aim)
             rotation = rotation_about(axis, float(np.arcsin(np.linalg.norm(axis))))
             base = heads[f"finger{finger}-1.{side}"]
             columns = [labels.index(f"finger{finger}-{k}.{side}") for k in (1, 2, 3)]

@@ -138,12 +138,12 @@ class Figure:
             ("left", self.left_arm, self.left_leg),
             ("right", self.right_arm, self.right_leg),
         ):
-            own = dict(zip(_ARM_ANGLES, astuple(arm), strict=True))
+            limb_angles = dict(zip(_ARM_ANGLES, astuple(arm), strict=True))
             if isinstance(leg, Foot):
-                own |= _leg_angles(skeleton, *self.pelvis(skeleton), leg, side)
+                limb_angles |= _leg_angles(skeleton, *self.pelvis(skeleton), leg, side)
             else:
-                own |= zip(_LEG_ANGLES, astuple(leg), strict=True)
-            angles |= {f"{side} {name}": value for name, value in own.items()}
+                limb_angles |= zip(_LEG_ANGLES, astuple(leg), strict=True)
+            angles |= {f"{side} {name}": value for name, value in limb_angles.items()}
         return angles
 
 

@@ -235,8 +235,8 @@ class Skeleton:
         for side in ("left", "right"):
             # The right limbs mirror the left ones.
             reflect = np.eye(3) if side == "left" else MIRROR
-            own = {n: angles.get(f"{side} {n}", 0.0) for n in _LIMB_ANGLES}
-            local = self._arm(own) | self._leg(own)
+            limb_angles = {n: angles.get(f"{side} {n}", 0.0) for n in _LIMB_ANGLES}
+            local = self._arm(limb_angles) | self._leg(limb_angles)
             for name, rotation in local.items():
                 base = chest if name in _ARM_BONES else orientation
                 rotations[BONES.index(f"{side} {name}")] = base @ reflect @ rotation @ reflect

@@ -182,5 +182,5 @@ def _meeting(
     n = np.int64(len(second[0]))
     a, b = np.divmod(np.unique(pairs @ np.array([n, 1])), n)
     meet = ((first[0][a] <= second[1][b]) & (second[0][b] <= first[1][a])).all(axis=1)
-    kept: list[list[int]] = np.stack([a, b], axis=1)[meet].tolist()
-    return kept
+    meeting_pairs: list[list[int]] = np.stack([a, b], axis=1)[meet].tolist()
+    return meeting_pairs

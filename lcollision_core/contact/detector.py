@@ -674,8 +674,8 @@ class CollisionDetector:
         """
         array = np.asarray(vertices)
         if array.ndim != len(shape) or array.shape[-2:] != shape[-2:]:
-            wanted = ", ".join("B" if size < 0 else str(size) for size in shape)
-            raise ShapeError.must_be("vertices", f"of shape ({wanted})", array.shape)
+            shape_text = ", ".join("B" if size < 0 else str(size) for size in shape)
+            raise ShapeError.must_be("vertices", f"of shape ({shape_text})", array.shape)
         return array if array.dtype.kind == "f" else array.astype(np.float64)
 
     def _count(

@@ -118,12 +118,12 @@ def _creases(
         if group.name not in branches:
             joints.append(middle)
             of_joints.append(length_there)
-    known = np.flatnonzero(np.isfinite(length))
-    if not len(known):
+    reached = np.flatnonzero(np.isfinite(length))
+    if not len(reached):
         return None
-    _, nearest = cKDTree(reference[known]).query(reference)
+    _, nearest = cKDTree(reference[reached]).query(reference)
     places = np.array(joints).reshape(-1, 3)
-    return Creases(reference, length[known[nearest]], places, np.array(of_joints))
+    return Creases(reference, length[reached[nearest]], places, np.array(of_joints))
 
 
 def with_other_rules(

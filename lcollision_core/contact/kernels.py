@@ -416,13 +416,13 @@ def _search_leaves(
     corner_base = np.uint64(leaf_b) * _LEAF_CORNERS
     box_base = np.uint64(leaf_b) * _LEAF_BOXES
     for i in range(LEAF_SIZE):
-        own = np.uint64(leaf_a) * _LEAF_BOXES + np.uint64(i)
-        x0 = boxes[own]
-        y0 = boxes[own + _LEAF]
-        z0 = boxes[own + np.uint64(2) * _LEAF]
-        x1 = boxes[own + np.uint64(3) * _LEAF]
-        y1 = boxes[own + np.uint64(4) * _LEAF]
-        z1 = boxes[own + np.uint64(5) * _LEAF]
+        place_a = np.uint64(leaf_a) * _LEAF_BOXES + np.uint64(i)
+        x0 = boxes[place_a]
+        y0 = boxes[place_a + _LEAF]
+        z0 = boxes[place_a + np.uint64(2) * _LEAF]
+        x1 = boxes[place_a + np.uint64(3) * _LEAF]
+        y1 = boxes[place_a + np.uint64(4) * _LEAF]
+        z1 = boxes[place_a + np.uint64(5) * _LEAF]
         if not (
             (x0 <= box_b[3])
             & (box_b[0] <= x1)
@@ -432,10 +432,10 @@ def _search_leaves(
             & (box_b[2] <= z1)
         ):
             continue
-        own = np.uint64(leaf_a) * _LEAF_CORNERS + np.uint64(i)
-        f0 = corners[own]
-        f1 = corners[own + _LEAF]
-        f2 = corners[own + np.uint64(2) * _LEAF]
+        place_a = np.uint64(leaf_a) * _LEAF_CORNERS + np.uint64(i)
+        f0 = corners[place_a]
+        f1 = corners[place_a + _LEAF]
+        f2 = corners[place_a + np.uint64(2) * _LEAF]
         # Nearly all rows hold only neighbours: test a whole row first, then its faces if needed.
         some = np.int32(0)
         for k in range(np.uint64(leaf_size)):

@@ -88,26 +88,26 @@ def touching_patches(
         job.check()
         touching.append(detector.detect(pose, counted_only=True).pairs)
         job.report(done + 1, len(vertices))
-    seen, places = np.unique(np.concatenate(touching), axis=0, return_inverse=True)
-    if not len(seen):
+    patch_pairs, places = np.unique(np.concatenate(touching), axis=0, return_inverse=True)
+    if not len(patch_pairs):
         return ()
-    middles, near = _patches(detector, np.unique(seen), radius)
-    of_first, of_second = near[seen[:, 0]], near[seen[:, 1]]
+    middles, near = _patches(detector, np.unique(patch_pairs), radius)
+    of_first, of_second = near[patch_pairs[:, 0]], near[patch_pairs[:, 1]]
     n_poses_of = sparse.csr_matrix(2 * (len(middles),), dtype=np.int32)
     ends = np.cumsum([len(pairs) for pairs in touching])
     for rows in np.split(places.ravel(), ends[:-1]):
         one_way = of_first[rows].T @ of_second[rows]
         n_poses_of += ((one_way + one_way.T) > 0).astype(np.int32)
     often = sparse.triu(n_poses_of).tocoo()
-    chosen = often.data >= NEARLY_ALWAYS * len(vertices)
+    is_frequent = often.data >= NEARLY_ALWAYS * len(vertices)
     patches = np.stack([often.row, often.col], axis=1)
     if of_pieces:
         are_made_so = _of_touching_pieces(detector, touching, middles[patches])
         centres = detector.reference[detector.topology.faces[middles]].mean(axis=1)
         away = np.linalg.norm(np.subtract(*centres[patches].transpose(1, 0, 2)), axis=1)
         are_made_so &= away <= _PIECES_NEAR * radius * detector.body_size
-        chosen |= are_made_so & (often.data >= _PIECES_PLACE * len(vertices))
-    return _covering(of_first.tocsc(), of_second.tocsc(), patches[chosen], middles)
+        is_frequent |= are_made_so & (often.data >= _PIECES_PLACE * len(vertices))
+    return _covering(of_first.tocsc(), of_second.tocsc(), patches[is_frequent], middles)
 
 
 def _of_touching_pieces(
@@ -146,13 +146,13 @@ def _patches(
         return faces_within(surface, some, share * radius * detector.body_size, require)
 
     close = within(faces, _SEARCHED_SHARE)
-    chosen: list[int] = []
+    patch_roots: list[int] = []
     is_covered = np.zeros(detector.topology.n_faces, dtype=np.bool_)
     for place, face in enumerate(faces.tolist()):
         if not is_covered[face]:
             is_covered[close.entry[close.start[place] : close.start[place + 1]]] = True
-            chosen.append(face)
-    middles = np.array(chosen, dtype=np.int32)
+            patch_roots.append(face)
+    middles = np.array(patch_roots, dtype=np.int32)
     lists = within(middles, 1.0)
     shape = (len(middles), detector.topology.n_faces)
     ones = np.ones(len(lists.entry), dtype=np.int32)
@@ -177,13 +177,13 @@ def _covering(
         rows = [np.intersect1d(*_rows(of_first, i, of_second, j)) for i, j in ways]
         covered.append(np.union1d(*rows))
     is_covered = np.zeros(of_first.shape[0], dtype=np.bool_)
-    chosen = []
+    covering_pairs = []
     for place in sorted(range(len(covered)), key=lambda place: -len(covered[place])):
         if not is_covered[covered[place]].all():
             is_covered[covered[place]] = True
             a, b = sorted(middles[patches[place]].tolist())
-            chosen.append((a, b))
-    return tuple(chosen[:MAX_TOUCHING])
+            covering_pairs.append((a, b))
+    return tuple(covering_pairs[:MAX_TOUCHING])
 
 
 def _rows(

@@ -203,9 +203,9 @@ class UncountedTables:
 
     def _make(self) -> None:
         # The interpreter waits for this thread on exit.
-        made = make_uncounted(self._tree, self._exclusions, threading.main_thread().is_alive)
-        if made is not None:
-            self._made = made
+        tables = make_uncounted(self._tree, self._exclusions, threading.main_thread().is_alive)
+        if tables is not None:
+            self._made = tables
 
 
 def make_uncounted(
@@ -230,7 +230,7 @@ def make_uncounted(
     stride = -(-size // 8)
     start = np.cumsum(size * stride) - size * stride
     bits = np.zeros(size @ stride, dtype=np.uint8)
-    made = UncountedNodes(level, number, start, stride, bits)
+    tables = UncountedNodes(level, number, start, stride, bits)
     near = _both_ways(exclusions.near_start, exclusions.near)
     rest = _both_ways(exclusions.start, exclusions.face)
     touching = _both_ways(exclusions.touching_start, exclusions.touching)
@@ -238,10 +238,10 @@ def make_uncounted(
         if not goes_on():
             return None
         stop = min(first + _LEAVES_AT_ONCE, int(size[leaves]))
-        _fill_leaves(tree, LEAF_SIZE, exclusions, near, rest, touching, first, stop, made)
+        _fill_leaves(tree, LEAF_SIZE, exclusions, near, rest, touching, first, stop, tables)
     for nodes in reversed(inner):
-        _fill_inner(tree, nodes, made)
-    return made
+        _fill_inner(tree, nodes, tables)
+    return tables
 
 
 class _BothWays(NamedTuple):
@@ -652,9 +652,9 @@ class Searcher:
         """Copy (B, V, 3) poses, moving vertices that no face uses to one that a face uses."""
         if len(poses) > len(self._poses):
             self._poses = np.empty((len(poses), *self._poses.shape[1:]))
-        taken = self._poses[: len(poses)]
-        np.copyto(taken, poses)
-        taken[:, self._unused] = taken[:, self._used, None]
+        workspace = self._poses[: len(poses)]
+        np.copyto(workspace, poses)
+        workspace[:, self._unused] = workspace[:, self._used, None]
         self._scale = unit / self._body_size
 
     def _judged(
@@ -682,13 +682,13 @@ class Searcher:
     def _keep_coincident(self, n_found: int) -> int:
         """Drop pairs that neither penetrate nor coincide; return the number left."""
         candidates = self.found
-        kept = candidates.squared_depth[:n_found] > 0.0
-        apart = np.flatnonzero(~kept)
+        is_deep = candidates.squared_depth[:n_found] > 0.0
+        apart = np.flatnonzero(~is_deep)
         corners = self._faces[self._tree.slot_face[candidates.slots[apart]]]
-        kept[apart] = coincide(self._work.vertices[corners], DEPTH_TOLERANCE)
-        n_kept = int(kept.sum())
+        is_deep[apart] = coincide(self._work.vertices[corners], DEPTH_TOLERANCE)
+        n_kept = int(is_deep.sum())
         for array in (candidates.slots, candidates.squared_depth):
-            array[:n_kept] = array[:n_found][kept]
+            array[:n_kept] = array[:n_found][is_deep]
         return n_kept
 
     @property

@@ -221,10 +221,10 @@ class PoseDraws:
 
     def blends(self, n_poses: int, uniform: Uniform) -> FloatArray:
         """Blend three known poses each, with weights uniform on the simplex: (n_poses, D)."""
-        chosen = self._chosen(uniform((n_poses, _BLENDED)))
+        pose_numbers = self._chosen(uniform((n_poses, _BLENDED)))
         weights = -np.log1p(-uniform((n_poses, _BLENDED)))
         weights /= np.maximum(weights.sum(axis=1, keepdims=True), np.finfo(float).tiny)
-        blended: FloatArray = np.einsum("ni,nid->nd", weights, self.known[chosen])
+        blended: FloatArray = np.einsum("ni,nid->nd", weights, self.known[pose_numbers])
         return blended
 
     def noisy_blends(self, n_poses: int, uniform: Uniform) -> FloatArray:
@@ -239,8 +239,8 @@ class PoseDraws:
     def mixed_parts(self, n_poses: int, uniform: Uniform) -> FloatArray:
         """Take each body part from another known pose: (n_poses, D)."""
         n_parts = int(self.part_of_code.max()) + 1
-        chosen = self._chosen(uniform((n_poses, n_parts)))
-        return self.known[chosen[:, self.part_of_code], np.arange(len(self.low))]
+        pose_numbers = self._chosen(uniform((n_poses, n_parts)))
+        return self.known[pose_numbers[:, self.part_of_code], np.arange(len(self.low))]
 
     def between(self, n_poses: int, uniform: Uniform) -> FloatArray:
         """Draw poses on motions through four known poses each: (n_poses, D), in the box.
@@ -545,9 +545,9 @@ class Embedding:
 
         A lock of the domains holds these codes.
         """
-        chosen = np.zeros(self.n_domains, dtype=np.bool_)
-        chosen[list(domains)] = True
-        return chosen[self.domain_of_code]
+        is_wanted = np.zeros(self.n_domains, dtype=np.bool_)
+        is_wanted[list(domains)] = True
+        return is_wanted[self.domain_of_code]
 
     @cached_property
     def domain_of_code(self) -> npt.NDArray[np.intp]:

@@ -144,10 +144,10 @@ class FeatureDecoder:
         by_codes = np.zeros((len(scaled), len(codes)))
         tables = self._tables
         for number, group in enumerate(self.groups):
-            own = slice(*tables.first_code[number : number + 2])
+            group_codes = slice(*tables.first_code[number : number + 2])
             blocks = tables.numbers[slice(*tables.first_number[number : number + 2])]
             blocks = blocks.reshape(-1, len(group.weights), _BLOCK)
-            _pull_group(codes[own], blocks, group.support, scaled, by_codes[:, own])
+            _pull_group(codes[group_codes], blocks, group.support, scaled, by_codes[:, group_codes])
         return by_codes
 
     def _checked(self, latent: npt.NDArray[Any]) -> Float32Array:

@@ -113,8 +113,8 @@ def solve(poisson, row_start, column, by_row, sides, mean):
         for i in range(n_free, sides.shape[0]):
             sides[i, a, pose] = 0.0
         for v in range(sides.shape[0]):
-            own = poisson.component[v]
-            mean[own, a, pose] += poisson.anchor[v] * sides[poisson.position[v], a, pose]
+            component = poisson.component[v]
+            mean[component, a, pose] += poisson.anchor[v] * sides[poisson.position[v], a, pose]
 
 
 @cuda.jit
@@ -122,10 +122,10 @@ def unload_vertices(poisson, sides, mean, rest_mean, body_size, vertices):
     """Write the vertices (B, V, 3) in the data's unit, a row of blocks per vertex."""
     first = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
     for v in range(cuda.blockIdx.y, sides.shape[0], cuda.gridDim.y):
-        own, position = poisson.component[v], poisson.position[v]
+        component, position = poisson.component[v], poisson.position[v]
         for pose in range(first, sides.shape[2], cuda.gridDim.x * cuda.blockDim.x):
             for a in range(3):
-                place = sides[position, a, pose] - mean[own, a, pose] + rest_mean[v, a]
+                place = sides[position, a, pose] - mean[component, a, pose] + rest_mean[v, a]
                 vertices[pose, v, a] = place * body_size
 
 
@@ -139,12 +139,12 @@ class GpuDecoder:
     """
 
     def __init__(self, embedding: Embedding, body_size: float) -> None:
-        groups, own, n = embedding.decoder.groups, embedding.codec, embedding.topology.n_vertices
+        groups, codec, n = embedding.decoder.groups, embedding.codec, embedding.topology.n_vertices
         place = np.full((len(groups), n), -1, dtype=np.int32)
         for row, group in zip(place, groups, strict=True):
             row[group.support] = np.arange(len(group.support))
         self._body_size, self._n_vertices, self._buffers = body_size, n, Buffers()
-        self._n_components = int(own.poisson.component.max()) + 1
+        self._n_components = int(codec.poisson.component.max()) + 1
         self._tables = tuple(
             map(
                 cuda.to_device,
@@ -158,13 +158,13 @@ class GpuDecoder:
                 ),
             )
         )
-        size = len(own.poisson.inverse_pivot)
-        by_column = (own.poisson.lower, own.poisson.row, own.poisson.column_start)
+        size = len(codec.poisson.inverse_pivot)
+        by_column = (codec.poisson.lower, codec.poisson.row, codec.poisson.column_start)
         rows = sparse.csc_matrix(by_column, shape=(size, size)).tocsr()
         rows.sort_indices()
-        self._poisson = copied(own.poisson)
+        self._poisson = copied(codec.poisson)
         self._rows = tuple(map(cuda.to_device, (rows.indptr, rows.indices, rows.data)))
-        self._rest_mean = cuda.to_device(own.rest_mean)
+        self._rest_mean = cuda.to_device(codec.rest_mean)
         self.at_once = max(1, min(4096, _BYTES_AT_ONCE // (108 * n)))
 
     def decode(self, codes: npt.NDArray[Any]) -> DeviceArray:

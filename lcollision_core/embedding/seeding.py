@@ -199,14 +199,14 @@ def radius_of_overlap(distances: FloatArray, overlap: float) -> float:
     -------
     radius : distance at which the windows have faded to 0
     """
-    wanted = min(overlap, 0.5 * (len(distances) + 1))
+    target_overlap = min(overlap, 0.5 * (len(distances) + 1))
     low, high = _LEAST_RADIUS, 2.0
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         squared = windows(distances, middle) ** 2
         fractions = squared / squared.sum(axis=0)
         reached = float((1.0 / (fractions**2).sum(axis=0)).mean())
-        low, high = (middle, high) if reached < wanted else (low, middle)
+        low, high = (middle, high) if reached < target_overlap else (low, middle)
     return high
 
 
@@ -325,20 +325,20 @@ def keep_one_patch(
     -------
     components : (K, V, 9) float32 array, a copy with islands set to 0
     """
-    kept = components.copy()
+    patches = components.copy()
     edges = bridged_edges(topology, rest_vertices)
     while True:
-        squared = (kept.astype(np.float64) ** 2).sum(axis=2)
+        squared = (patches.astype(np.float64) ** 2).sum(axis=2)
         # The masks use each component at unit norm.
         squared /= squared.sum(axis=1, keepdims=True)
         # Vertices that no component touches belong to no patch; they later follow their neighbours.
         owner = np.where(squared.max(axis=0) > 0.0, squared.argmax(axis=0), -1)
-        islands = owner[None] == np.arange(len(kept))[:, None]
-        for domain, patch in enumerate(_largest_patches(owner, len(kept), edges)):
+        islands = owner[None] == np.arange(len(patches))[:, None]
+        for domain, patch in enumerate(_largest_patches(owner, len(patches), edges)):
             islands[domain, patch] = False
         if not islands.any():
-            return kept
-        kept[islands] = 0.0
+            return patches
+        patches[islands] = 0.0
 
 
 def _largest_patches(

@@ -271,7 +271,7 @@ class BilevelTrainer:
             arounds.append(differentiable_ring_mean(inputs[-1], network.ring))
             supports.append(support)
         indices = [torch.from_numpy(support.astype(np.int64)) for support in supports]
-        base, wanted = torch.from_numpy(level1_output), torch.from_numpy(self._centred)
+        base, target_output = torch.from_numpy(level1_output), torch.from_numpy(self._centred)
         offset = torch.from_numpy(self._unscaling.offset.astype(np.float32))
         scale = torch.from_numpy(self._unscaling.scale.astype(np.float32))
         targets = torch.from_numpy(self._vertices.astype(np.float32))
@@ -289,7 +289,9 @@ class BilevelTrainer:
                     networks, inputs, arounds, indices, strict=True
                 ):
                     rebuilt = rebuilt.index_add(1, index, network(values[batch], around[batch]))
-                feature_loss = ((rebuilt - wanted[batch]) ** 2).sum() / (len(batch) * n_vertices)
+                feature_loss = ((rebuilt - target_output[batch]) ** 2).sum() / (
+                    len(batch) * n_vertices
+                )
                 decoded = decode_features(offset + scale * rebuilt, self._codec)
                 squared = ((decoded - targets[batch]) ** 2).sum(dim=2)
                 (feature_loss + config.vertex_weight * squared.mean()).backward()

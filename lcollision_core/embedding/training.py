@@ -116,7 +116,7 @@ class _Trainer:
             {"vertices": pose_set.vertices, "faces": pose_set.faces},
             {**asdict(config), "seed": seed, "version": _RUN_VERSION},
         )
-        kept = Checkpoint(checkpoint, key)
+        checkpoint_file = Checkpoint(checkpoint, key)
         self._picked = topology.picked
         alignment = align_rigid(vertices[:, self._picked], vertices[0, self._picked], job)
         weights = np.zeros(topology.n_vertices)
@@ -136,7 +136,7 @@ class _Trainer:
         epochs = config.level1_epochs + config.level2_epochs
         n_fits = 0 if config.encoded_codes else len(vertices) + 2 * len(self._held_out)
         total = epochs * (2 if len(self._held_out) else 1) + n_fits
-        self._run = Run(kept, job, total)
+        self._run = Run(checkpoint_file, job, total)
 
     def train(self) -> Embedding:
         embedding = self._learn("all poses", self._everyone)

@@ -124,18 +124,18 @@ def _read_clips(
             )
         mesh = join_parts(scene).cut_as(topology)
         frames, names = [mesh.posed(scene.rest)], ["rest"]
-        chosen = [clip] if clip is not None else [scene_clip.name for scene_clip in scene.clips]
+        clip_names = [clip] if clip is not None else [scene_clip.name for scene_clip in scene.clips]
         n_numbers = 0
-        for number, name in enumerate(chosen):
+        for number, name in enumerate(clip_names):
 
             def report(done: int, total: int, number: int = number) -> None:
-                job.report(number * total + done, len(chosen) * total)
+                job.report(number * total + done, len(clip_names) * total)
 
             times, poses = sample_clip(scene, name, fps, mesh.topology.n_vertices)
             n_numbers += len(times) * 3 * mesh.topology.n_vertices
             if n_numbers > MAX_FRAME_NUMBERS:
                 raise MeshFileError(
-                    f"its {len(chosen)} clips have more than {MAX_FRAME_NUMBERS} coordinates",
+                    f"its {len(clip_names)} clips have more than {MAX_FRAME_NUMBERS} coordinates",
                     "choose one of them, or fewer frames a second",
                 )
             frames.append(mesh.posed(poses, job.part(report)))
@@ -207,8 +207,10 @@ def _up_axis(scene: Scene | None) -> int | None:
 
 def _require_same_body(path: Path, file: Path, mesh: Mesh, frame: FloatArray) -> None:
     """Refuse a cache whose first frame has another unit or vertex order than the mesh."""
-    known, lengths = (mesh.topology.edge_lengths(vertices) for vertices in (mesh.vertices, frame))
-    scale = scale_of(lengths, known)
+    mesh_lengths, lengths = (
+        mesh.topology.edge_lengths(vertices) for vertices in (mesh.vertices, frame)
+    )
+    scale = scale_of(lengths, mesh_lengths)
     tiny = np.finfo(np.float64).tiny
     if scale is not None and not 1.0 / LARGEST_SIZE < scale < LARGEST_SIZE:
         raise MeshFileError(
@@ -216,10 +218,10 @@ def _require_same_body(path: Path, file: Path, mesh: Mesh, frame: FloatArray) ->
             "export both in one unit",
             where=path,
         )
-    known = known / max(body_size(mesh.vertices, mesh.topology), tiny)
+    mesh_lengths = mesh_lengths / max(body_size(mesh.vertices, mesh.topology), tiny)
     lengths = lengths / max(body_size(frame, mesh.topology), tiny)
     # Either of the two may be the one whose vertices do not match the faces.
-    if is_torn(lengths, known) or is_torn(known, lengths):
+    if is_torn(lengths, mesh_lengths) or is_torn(mesh_lengths, lengths):
         raise MeshFileError(
             f"has a different vertex order from {file.name}",
             "export both from the same mesh, the mesh with its vertex order kept",

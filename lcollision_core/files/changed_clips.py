@@ -104,9 +104,9 @@ def clip_vertices(data: bytes, path: Path, clip: str, times: FloatArray) -> Iter
     with as_file_error(path):
         scene = scene_of(GltfDocument(data, path))
         mesh = join_parts(scene)
-        found = next(one for one in scene.clips if one.name == clip)
+        scene_clip = next(one for one in scene.clips if one.name == clip)
         for start in range(0, len(times), _AT_ONCE):
-            yield from mesh.posed(found.sample(times[start : start + _AT_ONCE]))
+            yield from mesh.posed(scene_clip.sample(times[start : start + _AT_ONCE]))
 
 
 def _change(file: CharacterFile, patch: GltfDocument, rig: Rig, change: ChangedClip) -> None:
@@ -121,14 +121,16 @@ def _change(file: CharacterFile, patch: GltfDocument, rig: Rig, change: ChangedC
         )
         new_rotation, new_translation = rotation, translation
         for rows, (before, at, after) in change.spans_in_time():
-            own = turns[rows, joint]
-            if np.abs(own - np.eye(4)).max() <= _UNCHANGED:
+            joint_turns = turns[rows, joint]
+            if np.abs(joint_turns - np.eye(4)).max() <= _UNCHANGED:
                 continue
             old, sizes = Rotation.from_quat(rotation.at(at)[:, 0]), scale.at(at)[:, 0]
-            turned = (old * Rotation.from_matrix(_unscaled(own[:, :3, :3], sizes))).as_quat()
+            turned = (
+                old * Rotation.from_matrix(_unscaled(joint_turns[:, :3, :3], sizes))
+            ).as_quat()
             new_rotation = new_rotation.with_span(before, at, after, turned[:, None])
-            if np.abs(own[:, :3, 3]).max() > _UNCHANGED:
-                moved = translation.at(at)[:, 0] + old.apply(sizes * own[:, :3, 3])
+            if np.abs(joint_turns[:, :3, 3]).max() > _UNCHANGED:
+                moved = translation.at(at)[:, 0] + old.apply(sizes * joint_turns[:, :3, 3])
                 new_translation = new_translation.with_span(before, at, after, moved[:, None])
         for track, new in ((rotation, new_rotation), (translation, new_translation)):
             if new is not track:
@@ -151,8 +153,8 @@ def _change(file: CharacterFile, patch: GltfDocument, rig: Rig, change: ChangedC
 
 def _unscaled(turns: FloatArray, sizes: FloatArray) -> FloatArray:
     """Conjugate (n, 3, 3) turns, applied before (n, 3) scales, to apply after them."""
-    held = np.where(np.abs(sizes) > _UNCHANGED, sizes, 1.0)
-    return held[:, :, None] * turns / held[:, None, :]
+    divisors = np.where(np.abs(sizes) > _UNCHANGED, sizes, 1.0)
+    return divisors[:, :, None] * turns / divisors[:, None, :]
 
 
 def _local_turns(rig: Rig, change: ChangedClip) -> FloatArray:

@@ -97,15 +97,15 @@ class CharacterFile:
         return list(self._stored_normals())
 
     def _stored_normals(self) -> Iterator[FloatArray | None]:
-        for _, shown, _ in self.parts:
-            mesh = self.document.objects("meshes")[shown.mesh]
-            number = mesh["primitives"][shown.primitive]["attributes"].get("NORMAL")
+        for _, part, _ in self.parts:
+            mesh = self.document.objects("meshes")[part.mesh]
+            number = mesh["primitives"][part.primitive]["attributes"].get("NORMAL")
             if number is None:
                 yield None
                 continue
-            what = f"the normals of mesh {shown.mesh}"
-            stored = self.document.array(number, what, ("VEC3",), shown.n_vertices)
-            yield np.tile(as_float(stored), (shown.n_instances, 1))
+            what = f"the normals of mesh {part.mesh}"
+            stored = self.document.array(number, what, ("VEC3",), part.n_vertices)
+            yield np.tile(as_float(stored), (part.n_instances, 1))
 
     def normals(self, vertices: FloatArray) -> FloatArray:
         """Return the unit normals of the file's W vertices in a pose; 0 where none are stored."""

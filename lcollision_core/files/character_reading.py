@@ -145,9 +145,9 @@ def _joined(
     beyond = np.unique(across[~inside[across]])
     if not len(beyond):
         used = topology.used_vertices
-        others, own = used[~inside[used]], used[inside[used]]
-        if len(own) and len(others):
-            away, _ = cKDTree(rest_vertices[own]).query(rest_vertices[others])
+        others, inside_rows = used[~inside[used]], used[inside[used]]
+        if len(inside_rows) and len(others):
+            away, _ = cKDTree(rest_vertices[inside_rows]).query(rest_vertices[others])
             beyond = others[away <= min(near, _NEARLY * away.min())]
     joined: npt.NDArray[np.int64] = np.bincount(led_by[beyond], minlength=n_joints)
     return joined
@@ -406,12 +406,16 @@ def _points_of_frames(
     frames = np.flatnonzero(is_own)
     if not len(frames):
         return {}
-    own = [of_part[frames] for of_part in poses.weights]
-    values = np.concatenate([*own, transforms[frames][:, carried].reshape(len(frames), -1)], axis=1)
+    part_weights = [of_part[frames] for of_part in poses.weights]
+    values = np.concatenate(
+        [*part_weights, transforms[frames][:, carried].reshape(len(frames), -1)], axis=1
+    )
     _, first, kind = np.unique(values, axis=0, return_index=True, return_inverse=True)
 
     def made(at: int) -> FloatArray:
-        points = _points(scene, mesh, transforms[frames[at]], tuple(one[at] for one in own))
+        points = _points(
+            scene, mesh, transforms[frames[at]], tuple(one[at] for one in part_weights)
+        )
         if rig.shapes is not None and numbers is not None:
             points[rig.weights > 0.0] -= rig.shapes.offsets(numbers[frames[at]])
         return points
@@ -438,18 +442,20 @@ def _shapes(scene: Scene, mesh: JoinedMesh, weights: FloatArray) -> Shapes | Non
             added = np.tensordot(mix[used], morphs.deltas[used], axes=1)
             moved = np.flatnonzero(added.any(axis=1))
             vertices = morphs.vertices[moved]
-            held = weighing[vertices]
-            by_bone = np.einsum("vijk,vk->vij", turns[vertices], added[moved])[held]
-            rows.append((3 * row_of[vertices][held][:, None] + np.arange(3)).reshape(-1))
+            shape_weights = weighing[vertices]
+            by_bone = np.einsum("vijk,vk->vij", turns[vertices], added[moved])[shape_weights]
+            rows.append((3 * row_of[vertices][shape_weights][:, None] + np.arange(3)).reshape(-1))
             values.append(by_bone.reshape(-1))
         columns.append((np.concatenate(rows), np.concatenate(values)))
-    kept = [number for number, (rows, _) in enumerate(columns) if len(rows)]
-    if not kept:
+    shape_numbers = [number for number, (rows, _) in enumerate(columns) if len(rows)]
+    if not shape_numbers:
         return None
-    ends = np.cumsum([0, *(len(columns[number][0]) for number in kept)])
-    parts = (np.concatenate([columns[number][place] for number in kept]) for place in (1, 0))
-    deltas = csc_matrix((*parts, ends), shape=(3 * int(weighing.sum()), len(kept)))
-    names = tuple(names[number] for number in kept)
+    ends = np.cumsum([0, *(len(columns[number][0]) for number in shape_numbers)])
+    parts = (
+        np.concatenate([columns[number][place] for number in shape_numbers]) for place in (1, 0)
+    )
+    deltas = csc_matrix((*parts, ends), shape=(3 * int(weighing.sum()), len(shape_numbers)))
+    names = tuple(names[number] for number in shape_numbers)
     mixes, sources = [], np.full((len(names), 2), -1)
     low, high = np.zeros(len(names)), np.ones(len(names))
     for number, (part, at_rest) in enumerate(zip(scene.parts, scene.rest.weights, strict=True)):
@@ -612,13 +618,13 @@ def as_gltf(character: Character) -> GltfCharacter:
     place[:3, :3] = frame.scale * frame.rotation
     source = Path(character.source)
     with as_file_error(source, "cannot be written as GLB"):
-        made = gltf_of(file.scene, place, character.name, source)
-        written = character_of(scene_of(GltfDocument(made.data, source)), source)
-        if len(written.joined) != len(made.vertices):
+        document = gltf_of(file.scene, place, character.name, source)
+        written = character_of(scene_of(GltfDocument(document.data, source)), source)
+        if len(written.joined) != len(document.vertices):
             raise MeshFileError("parts of it would be lost")
         from_read, to_read = np.empty(len(written.rest_vertices), np.int64), np.empty_like(rows)
-        from_read[written.joined] = character.joined[made.vertices]
-        to_read[character.joined[made.vertices]] = written.joined
+        from_read[written.joined] = character.joined[document.vertices]
+        to_read[character.joined[document.vertices]] = written.joined
         if character.rig is not None and written.rig is not None:
             number = {node: joint for joint, node in enumerate(character.rig.nodes.tolist())}
             if number.keys() != set(written.rig.nodes.tolist()):
@@ -630,7 +636,7 @@ def as_gltf(character: Character) -> GltfCharacter:
     notes = [
         f"{kind} can't be written, so {source.name} comes back as GLB, in metres and y up, without "
         "lights and cameras, and its materials keep only base colours and textures",
-        *made.notes,
+        *document.notes,
     ]
     if file.mesh.dual.any():
         notes.append("GLB blends skins linearly, so clips look as if dual quaternions were off")
@@ -638,7 +644,7 @@ def as_gltf(character: Character) -> GltfCharacter:
     off /= body_size(written.rest_vertices, written.topology)
     if off > _SAME:
         notes.append(f"its rest pose is off by {100.0 * off:.2g} % of the body size in it")
-    return GltfCharacter(written, frame, from_read, to_read, joints, made.delays, tuple(notes))
+    return GltfCharacter(written, frame, from_read, to_read, joints, document.delays, tuple(notes))
 
 
 def is_gltf(character: Character) -> bool:

@@ -26,15 +26,15 @@ def numbered_where_equal(
     key : maps a name to the value that must be unique, such as the name in lower case
     joined : appends an ending to a name, and may shorten the name for it
     """
-    taken: set[str] = set()
+    used_names: set[str] = set()
     counts: Counter[str] = Counter()
     result = []
     for name in names:
         candidate, base = name, key(name)
-        while (key_of_it := key(candidate)) in taken:
+        while (key_of_it := key(candidate)) in used_names:
             counts[base] += 1
             candidate = joined(name, f" {counts[base] + 1}")
-        taken.add(key_of_it)
+        used_names.add(key_of_it)
         result.append(candidate)
     return result
 

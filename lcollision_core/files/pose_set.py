@@ -456,8 +456,8 @@ def _without_outliers(
         return collected
     for pose, defect in outliers.items():
         report(PoseSetError.like(defect, f"pose {poses.names[pose]} of {poses.source}"))
-    kept = [pose for pose in range(len(poses)) if pose not in outliers]
-    return replace(collected, pose_set=_only(poses, kept))
+    inliers = [pose for pose in range(len(poses)) if pose not in outliers]
+    return replace(collected, pose_set=_only(poses, inliers))
 
 
 def _only(poses: PoseSet, kept: list[int]) -> PoseSet | None:
@@ -595,14 +595,14 @@ def _collect_frames(
         groups=frames.groups,
         metres=frames.metres,
     )
-    kept = []
+    kept_frames = []
     for pose, vertices in enumerate(frames.vertices):
         where = f"pose {pose} ({frames.names[pose]}) of {path}"
         if (too_far := _too_far_to_compute(where, vertices)) is not None:
             report(too_far)
         else:
-            kept.append(pose)
-    return PoseSetInspection(_only(pose_set, kept), len(frames.vertices), same_topology=True)
+            kept_frames.append(pose)
+    return PoseSetInspection(_only(pose_set, kept_frames), len(frames.vertices), same_topology=True)
 
 
 def _collect_npz(
@@ -621,7 +621,7 @@ def _collect_npz(
     except LCollisionError as error:
         report(MeshFileError.because(path, "cannot be read as a pose set", error))
         return PoseSetInspection(None)
-    kept = []
+    pose_numbers = []
     for pose, mesh in enumerate(vertices):
         where = f"pose {pose} ({pose_set.names[pose]}) of {path}"
         if (too_far := _too_far_to_compute(where, mesh)) is not None:
@@ -629,9 +629,9 @@ def _collect_npz(
         elif mesh.dtype == np.float32 and (coarseness := coarseness_of(mesh, topology)):
             report(PoseSetError(f"is damaged: {coarseness}", KEEP_PRECISION, where=where))
         else:
-            kept.append(pose)
+            pose_numbers.append(pose)
     job.report(len(vertices), len(vertices))
-    return PoseSetInspection(_only(pose_set, kept), len(vertices), same_topology=True)
+    return PoseSetInspection(_only(pose_set, pose_numbers), len(vertices), same_topology=True)
 
 
 def _meshes_of(
@@ -753,10 +753,10 @@ def concatenated(pose_sets: Sequence[PoseSet]) -> PoseSet:
         if (defect := disagreement(str(poses.source), poses.topology, first.topology)) is not None:
             raise defect
         is_repeated = poses is not first and np.array_equal(poses.vertices[0], first.vertices[0])
-        kept = slice(1, None) if is_repeated else slice(None)
+        rows = slice(1, None) if is_repeated else slice(None)
         stem = poses.source.stem if poses.source and not one_file else ""
-        vertices.append(poses.vertices[kept])
-        names += [f"{stem} {name}".strip() for name in poses.names[kept]]
+        vertices.append(poses.vertices[rows])
+        names += [f"{stem} {name}".strip() for name in poses.names[rows]]
         notes += [f"{stem}: {note}" if stem else note for note in poses.notes]
     n_items = sum(some.size for some in vertices)
     if n_items > MAX_ITEMS:
@@ -779,9 +779,9 @@ def _provenance(pose_sets: Sequence[PoseSet], counts: Sequence[int]) -> dict[str
         return {}
     parts: list[dict[str, Any]] = []
     for poses, count in zip(pose_sets, counts, strict=True):
-        known = poses.provenance.get("sources")
-        if isinstance(known, list):
-            parts += known
+        stored_sources = poses.provenance.get("sources")
+        if isinstance(stored_sources, list):
+            parts += stored_sources
         else:
             file = {"file": poses.source.name} if poses.source else {}
             parts.append({**file, "poses": count, **poses.provenance})
@@ -818,38 +818,38 @@ def thinned(poses: PoseSet, tolerance: float = TOLERANCE, job: Job = UNWATCHED) 
     ------
     CancelledError : the job was cancelled.
     """
-    kept = _kept(poses, tolerance, job)
-    n_left_out = len(poses) - len(kept)
+    pose_numbers = _kept(poses, tolerance, job)
+    n_left_out = len(poses) - len(pose_numbers)
     if not n_left_out:
         return poses
     what = "1 pose is" if n_left_out == 1 else f"{n_left_out} poses are"
     note = f"{what} left out as nearly the same as others, within {100 * tolerance:g} % of the body"
     return replace(
         poses,
-        vertices=poses.vertices[kept],
-        names=tuple(poses.names[pose] for pose in kept),
+        vertices=poses.vertices[pose_numbers],
+        names=tuple(poses.names[pose] for pose in pose_numbers),
         notes=(*poses.notes, f"{note} size"),
     )
 
 
 def _kept(poses: PoseSet, tolerance: float, job: Job) -> list[int]:
     used = poses.topology.used_vertices
-    chosen = used[np.unique(np.linspace(0, len(used) - 1, _VERTICES).astype(np.int64))]
+    sample = used[np.unique(np.linspace(0, len(used) - 1, _VERTICES).astype(np.int64))]
     size = body_size(poses.vertices[0], poses.topology)
-    points = poses.vertices[:, chosen].astype(np.float64) / size
+    points = poses.vertices[:, sample].astype(np.float64) / size
     points -= points.mean(axis=1, keepdims=True)
     # A rigid motion keeps the distance of two vertices, and moving them by a and b changes it by at
     # most a + b, so half the sum of squared changes of disjoint pairs is a lower bound.
-    half = len(chosen) // 2
+    half = len(sample) // 2
     spans = np.linalg.norm(points[:, :half] - points[:, half : 2 * half], axis=2)
-    kept: list[int] = []
+    pose_numbers: list[int] = []
     for pose, vertices in enumerate(points):
         job.check()
-        least = ((spans[kept] - spans[pose]) ** 2).sum(axis=1) / (2 * len(chosen))
-        near = np.array(kept, dtype=np.int64)[least < tolerance**2]
+        least = ((spans[pose_numbers] - spans[pose]) ** 2).sum(axis=1) / (2 * len(sample))
+        near = np.array(pose_numbers, dtype=np.int64)[least < tolerance**2]
         if (_squared_distances(points[near], vertices) >= tolerance**2).all():
-            kept.append(pose)
-    return kept
+            pose_numbers.append(pose)
+    return pose_numbers
 
 
 def _squared_distances(poses: FloatArray, vertices: FloatArray) -> FloatArray:

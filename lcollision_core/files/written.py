@@ -95,15 +95,15 @@ def _brief(source: dict[str, Any]) -> list[dict[str, Any]]:
     joints = {node for skin in source.get("skins", ()) for node in skin["joints"]}
     briefs = []
     for animation in source.get(_CLIPS, ()):
-        kept = [
+        showing_channels = [
             channel
             for channel in animation.get("channels", ())
             if channel["target"].get("path") in _SHOWING
             or channel["target"].get("node") not in (None, *joints)
         ]
-        if kept:
-            samplers = [animation["samplers"][channel["sampler"]] for channel in kept]
-            channels = [channel | {"sampler": n} for n, channel in enumerate(kept)]
+        if showing_channels:
+            samplers = [animation["samplers"][channel["sampler"]] for channel in showing_channels]
+            channels = [channel | {"sampler": n} for n, channel in enumerate(showing_channels)]
             briefs.append({"channels": channels, "samplers": samplers})
     return briefs
 
@@ -169,8 +169,8 @@ def read_own_file(document: SceneDocument) -> OwnFile | None:
         before = {key: source[key] for key in (*_CHANGED, _CLIPS) if key in source}
         source_document = document.described(document.description | before)
         character = character_of(scene_of(source_document), path)
-        shown = "".join(filter(str.isprintable, name))[:_LONGEST_NAME]
-        character = replace(character, name=shown or character.name, clips={})
+        printable_name = "".join(filter(str.isprintable, name))[:_LONGEST_NAME]
+        character = replace(character, name=printable_name or character.name, clips={})
         mesh = join_parts(posed)
         places = mesh.posed(posed.rest)[0][mesh.joined]
         rows: dict[int, list[FloatArray]] = {}
@@ -418,12 +418,16 @@ def write_character_clips(
     with as_file_error(character.source, "cannot be written with these poses"):
         source = _Source(character, file)
         left_out = [] if keep_clips else source.drop_clips()
-        own = [str(animation.get("name") or "") for animation in source.patch.objects("animations")]
-        names = numbered_where_equal([*own, *(clip.name for clip in clips)])[len(own) :]
+        clip_names = [
+            str(animation.get("name") or "") for animation in source.patch.objects("animations")
+        ]
+        names = numbered_where_equal([*clip_names, *(clip.name for clip in clips)])[
+            len(clip_names) :
+        ]
         for number, (clip, name) in enumerate(zip(clips, names, strict=True)):
             stored = source.animate(character.rig, clip, name, number)
-            for track, wanted in zip(stored, clip.vertices, strict=True):
-                source.require_near(track, wanted)
+            for track, frame_vertices in zip(stored, clip.vertices, strict=True):
+                source.require_near(track, frame_vertices)
                 seen(number, track)
         data = source.signed(rules)
     notes = (*source.patch.notes, *(f"its clip {clip!r} is left out" for clip in left_out))
@@ -539,8 +543,8 @@ class _Source:
     def _reweighed(self, weights: tuple[FloatArray, ...]) -> dict[int, FloatArray]:
         """Return the (N, M) weights of the nodes whose weights differ from those at rest."""
         parts, at_rest = self._scene.parts, by_node(self._scene.parts, self._scene.rest.weights)
-        found = by_node(parts, weights)
-        return {node: own for node, own in found.items() if (own != at_rest[node]).any()}
+        weights_of_node = by_node(parts, weights)
+        return {node: own for node, own in weights_of_node.items() if (own != at_rest[node]).any()}
 
     def animate(self, rig: Rig, clip: NewClip, name: str, place: int) -> Iterator[FloatArray]:
         """Add a clip of the joints' nodes and morph targets, and yield each frame's vertices.
@@ -566,8 +570,8 @@ class _Source:
                     key[frame] = part
                 return compose(*kept)
 
-            own = (one[min(frame, len(one) - 1)][None] for one in weights)
-            yield self._posed(rig, pose, hold, tuple(own))
+            frame_weights = (one[min(frame, len(one) - 1)][None] for one in weights)
+            yield self._posed(rig, pose, hold, tuple(frame_weights))
         seconds = np.arange(len(transforms)) / clip.fps
         times = self.patch.add_array(seconds[:, None], has_bounds=True)
         samplers: list[dict[str, Any]] = []
@@ -616,20 +620,20 @@ class _Source:
             raise ShapeError.must_be("transforms", f"of shape {rig.rest.shape}", transforms.shape)
         parents, rest = self._scene.parents, self._scene.rest.transforms[0]
         joints = set(rig.nodes.tolist())
-        wanted, placed = rest.copy(), rest.copy()
-        wanted[rig.nodes] = transforms
+        wanted_transforms, placed = rest.copy(), rest.copy()
+        wanted_transforms[rig.nodes] = transforms
         for number in parents_first(parents):
             parent, local = int(parents[number]), self._file.locals[number]
             above, wanted_above = (
-                (placed[parent], wanted[parent]) if parent >= 0 else (IDENTITY, IDENTITY)
+                (placed[parent], wanted_transforms[parent]) if parent >= 0 else (IDENTITY, IDENTITY)
             )
             if number in joints:
-                new = _relative(wanted_above, wanted[number])
+                new = _relative(wanted_above, wanted_transforms[number])
                 if np.abs(new - local).max() > _SAME_TRANSFORM * np.abs(new).max():
                     # Relative to the parent as stored, so that rounding errors do not add up.
-                    local = hold(number, _relative(above, wanted[number]))
+                    local = hold(number, _relative(above, wanted_transforms[number]))
             else:
-                wanted[number] = wanted_above @ local
+                wanted_transforms[number] = wanted_above @ local
             placed[number] = above @ local
         posed: FloatArray = self._file.mesh.posed(ScenePoses(placed[None], weights))[0]
         return posed
@@ -642,12 +646,12 @@ class _Source:
         moves = np.abs(vertices - self._rest).max(axis=1) > _SAME * self.size
         moving = {part.node for part, _, rows in self._parts if moves[self._joined[rows]].any()}
         had_morphs = False
-        for part, shown, rows in self._parts:
+        for part, shown_part, rows in self._parts:
             joined = self._joined[rows]
             if part.node not in skinned | moving:
                 stored[joined] = self._rest[joined]
                 continue
-            primitive = self._own_mesh(shown)["primitives"][shown.primitive]
+            primitive = self._own_mesh(shown_part)["primitives"][shown_part.primitive]
             attributes = primitive["attributes"]
             attributes["POSITION"] = self._vectors(stored[joined], has_bounds=True)
             if "NORMAL" in attributes:
@@ -698,22 +702,22 @@ class _Source:
         stored = np.empty_like(vertices)
         normals = self._file.normals(vertices)
         rest = self._scene.rest.transforms[0]
-        for (part, shown, rows), weights, own_normals in zip(
+        for (part, shown_part, rows), weights, own_normals in zip(
             self._parts, self._scene.rest.weights, self._file.stored_normals, strict=True
         ):
             turns = blended(part, rest)
             base = part.points + np.tensordot(weights[0], part.morphs, axes=1)
-            wanted = vertices[self._joined[rows]] - turns[:, :, 3]
+            target_offsets = vertices[self._joined[rows]] - turns[:, :, 3]
             try:
-                own = np.linalg.solve(turns[:, :, :3], wanted[:, :, None])[:, :, 0]
+                offsets = np.linalg.solve(turns[:, :, :3], target_offsets[:, :, None])[:, :, 0]
             except np.linalg.LinAlgError as error:
                 raise UnwritablePoseError(
                     "its joints flatten vertices at rest, which a morph target cannot undo"
                 ) from error
-            deltas = (own - base).astype(np.float32)
+            deltas = (offsets - base).astype(np.float32)
             stored[self._joined[rows]] = _moved(turns, base + deltas)
-            mesh = self._file.editable.description["meshes"][shown.mesh]
-            primitive = self._own_mesh(shown)["primitives"][shown.primitive]
+            mesh = self._file.editable.description["meshes"][shown_part.mesh]
+            primitive = self._own_mesh(shown_part)["primitives"][shown_part.primitive]
             target = {"POSITION": self._vectors(deltas, has_bounds=True)}
             if own_normals is not None:
                 # Readers transform normals by the inverse transpose.
@@ -754,9 +758,11 @@ class _Source:
         """Remove the animations that move the character, and return their names."""
         animations = self.patch.description.pop("animations", [])
         hiding = self._hiding(animations)
-        kept = [animation for number, animation in enumerate(animations) if number not in hiding]
-        if kept:
-            self.patch.description["animations"] = kept
+        kept_animations = [
+            animation for number, animation in enumerate(animations) if number not in hiding
+        ]
+        if kept_animations:
+            self.patch.description["animations"] = kept_animations
         return [str(animations[number].get("name", f"animation {number}")) for number in hiding]
 
     def hold_clips(self) -> None:

@@ -173,18 +173,18 @@ class Labeller:
         rows : their indices, at least one, starting at a multiple of `ROWS_PER_BLOCK`
         """
         done, waiting = {}, {block: self._label_block(seed, block) for block in blocks_of(rows)}
-        asked = {block: next(labelled) for block, labelled in waiting.items()}
+        labels_of_block = {block: next(labelled) for block, labelled in waiting.items()}
         # Label the requests of all blocks together: a GPU labels many poses in the time of a few.
-        while asked:
-            labels = self.label(np.concatenate(list(asked.values())))
-            stops = np.cumsum([len(codes) for codes in asked.values()])
-            for block, stop in zip(list(asked), stops.tolist(), strict=True):
-                own = labels.taken(slice(stop - len(asked[block]), stop))
+        while labels_of_block:
+            labels = self.label(np.concatenate(list(labels_of_block.values())))
+            stops = np.cumsum([len(codes) for codes in labels_of_block.values()])
+            for block, stop in zip(list(labels_of_block), stops.tolist(), strict=True):
+                block_labels = labels.taken(slice(stop - len(labels_of_block[block]), stop))
                 try:
-                    asked[block] = waiting[block].send(own)
+                    labels_of_block[block] = waiting[block].send(block_labels)
                 except StopIteration as end:
                     done[block] = end.value
-                    del asked[block]
+                    del labels_of_block[block]
         return LabelRows.joined([done[block] for block in waiting])
 
     def _label_block(self, seed: int, rows: range) -> _Asking:
@@ -218,13 +218,13 @@ class Labeller:
         bad = colliding[np.arange(_SEGMENTS) % len(colliding)]
         away = np.linalg.norm((free[None] - bad[:, None]) / self.embedding.latent_deviation, axis=2)
         good = free[away.argmin(axis=1)]
-        kept = []
+        border_codes = []
         for _ in range(_BISECTIONS):
             middle = yield 0.5 * (good + bad)
             good = np.where(middle.colliding[:, None], good, middle.latent)
             bad = np.where(middle.colliding[:, None], middle.latent, bad)
-            kept.append(middle)
-        return LabelRows.joined(kept[-_KEPT_BISECTIONS:])
+            border_codes.append(middle)
+        return LabelRows.joined(border_codes[-_KEPT_BISECTIONS:])
 
     def label(self, latent: npt.NDArray[Any]) -> LabelRows:
         """Label latent poses exactly, on the calling thread.

@@ -133,14 +133,14 @@ class LeftOut:
 
     def sentence(self, rules: ContactRules) -> str:
         """Describe the excluded pairs, their depth and the rules; empty if there are none."""
-        said = rules.sentence(self.counts)
+        sentence = rules.sentence(self.counts)
         if not self.frames:
-            return said
+            return sentence
         frames = "1 frame" if self.frames == 1 else f"{self.frames} frames"
         if self.step > 1:
             frames = f"{self.frames} of {self.searched} frames that were searched for all pairs"
         deep = f"up to {100.0 * self.deepest:.2f} % of the body size deep in frame {self.frame}"
-        return f"in {frames} {said}, {deep}"
+        return f"in {frames} {sentence}, {deep}"
 
 
 @dataclass(frozen=True)
@@ -220,8 +220,8 @@ class ContactRules:
                 )
         for name in self.left_out:
             if not _is_name(name):
-                shown = repr(name)[:MAX_GROUP_NAME_LENGTH]
-                raise ShapeError.must_be("what is left out", "the name of a group", shown)
+                quoted_name = repr(name)[:MAX_GROUP_NAME_LENGTH]
+                raise ShapeError.must_be("what is left out", "the name of a group", quoted_name)
 
     @property
     def named_groups(self) -> tuple[str, ...]:
@@ -262,7 +262,7 @@ class ContactRules:
         more = len(self.ignored) - _NAMED_PAIRS
         around = f" or within {self.rest_exclusion:g} of such a pair" if self.rest_exclusion else ""
         left_out = self.left_out_in_words().removeprefix("without ")
-        said = (
+        descriptions = (
             left_out and f"pairs of parts left out ({left_out})",
             self.near_exclusion and f"pairs {self._near_in_words()}",
             self.rest_exclusion is not None and f"pairs that touch at rest{around}",
@@ -272,7 +272,7 @@ class ContactRules:
             self.touching
             and f"pairs at {len(self.touching)} places that touch in nearly every pose",
         )
-        return ", ".join(what for what in said if what)
+        return ", ".join(what for what in descriptions if what)
 
     def in_short(self) -> str:
         """List the rules that apply in short, as in "touching at rest, at joints"."""
@@ -284,8 +284,8 @@ class ContactRules:
             "joint": self.joint_exclusion,
             "touching": self.touching,
         }
-        said = (_SHORTLY[name] for name, does in applies.items() if does)
-        return ", ".join(filter(None, (self.left_out_in_words(), *said)))
+        short_names = (_SHORTLY[name] for name, does in applies.items() if does)
+        return ", ".join(filter(None, (self.left_out_in_words(), *short_names)))
 
     def left_out_in_words(self) -> str:
         """List the groups left out, as in "without Axe, Cape"; empty if there are none."""
@@ -300,13 +300,13 @@ class ContactRules:
     def _tolerated_in_words(self) -> str:
         """List the tolerated depths, as in "0.001 or 0.01 between Belly and Hand"."""
         named, more = self.tolerated_pairs[:_NAMED_PAIRS], len(self.tolerated_pairs) - _NAMED_PAIRS
-        said = [
+        descriptions = [
             f"{depth:g} {f'within {first}' if first == other else f'between {first} and {other}'}"
             for first, other, depth in named
         ]
         if self.tolerated_depth or not named:
-            said.insert(0, f"{self.tolerated_depth:g}")
-        return " or ".join((*said, *(f"as {more} more pairs of groups say",) * (more > 0)))
+            descriptions.insert(0, f"{self.tolerated_depth:g}")
+        return " or ".join((*descriptions, *(f"as {more} more pairs of groups say",) * (more > 0)))
 
     def sentence(self, counts: RuleCounts | Mapping[str, int]) -> str:
         """Describe how many pairs are excluded by which rules; empty if there are none."""
@@ -316,7 +316,7 @@ class ContactRules:
         groups = " or ".join((*pairs, *("parts left out",) * bool(left_out)))
         if len(self.ignored) > _NAMED_PAIRS:
             groups = f"{len(self.ignored)} ignored pairs of groups"
-        said = [
+        counts_text = [
             f"{number} {'pair' if number == 1 else 'pairs'} {what}"
             for number, what in (
                 (counts.near, self._near_in_words()),
@@ -328,9 +328,9 @@ class ContactRules:
             )
             if number
         ]
-        if not said:
+        if not counts_text:
             return left_out
-        listed = " and ".join(filter(None, [", ".join(said[:-1]), said[-1]]))
+        listed = " and ".join(filter(None, [", ".join(counts_text[:-1]), counts_text[-1]]))
         not_counted = f"{listed} {'is' if counts.total == 1 else 'are'} not counted"
         return ", ".join(filter(None, (left_out, not_counted)))
 

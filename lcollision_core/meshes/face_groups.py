@@ -103,15 +103,15 @@ def groups_by_kind(
     """
     parts = () if vertex_labels is None else part_groups(topology, vertex_labels)
     computed = (parts, component_groups(topology))
-    known = {(group.name, group.faces.tobytes()) for kind in computed for group in kind}
-    own = tuple(
+    known_groups = {(group.name, group.faces.tobytes()) for kind in computed for group in kind}
+    file_groups = tuple(
         group
         for group in without_joints(groups)
-        if (group.name, group.faces.tobytes()) not in known
+        if (group.name, group.faces.tobytes()) not in known_groups
     )
-    taken = {group.name for group in own}
-    others = (tuple(group for group in kind if group.name not in taken) for kind in computed)
-    return dict(zip(GROUP_KINDS, (own, *others), strict=True))
+    used_names = {group.name for group in file_groups}
+    others = (tuple(group for group in kind if group.name not in used_names) for kind in computed)
+    return dict(zip(GROUP_KINDS, (file_groups, *others), strict=True))
 
 
 def with_named_groups(
@@ -128,8 +128,11 @@ def with_named_groups(
     names : see `ContactRules.named_groups`
     """
     named = {group.name for group in without_joints(groups)}
-    wanted = {*names} - named
-    return (*groups, *(group for kind in kinds.values() for group in kind if group.name in wanted))
+    missing_names = {*names} - named
+    return (
+        *groups,
+        *(group for kind in kinds.values() for group in kind if group.name in missing_names),
+    )
 
 
 def named_pair(
@@ -226,10 +229,10 @@ def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: in
         if len(faces) and not 0 <= faces[0] <= faces[-1] < n_faces:
             outside = faces[0] if faces[0] < 0 else faces[-1]
             raise ShapeError.must_be(where, f"of faces from 0 to {n_faces - 1}", int(outside))
-    known = dict.fromkeys(group.name for group in named)
+    group_names = dict.fromkeys(group.name for group in named)
     for name in rules.named_groups:
-        if name not in known:
-            listed = ", ".join(map(repr, list(known)[:8])) or "none: the mesh has no groups"
+        if name not in group_names:
+            listed = ", ".join(map(repr, list(group_names)[:8])) or "none: the mesh has no groups"
             raise ShapeError("is unknown", where=f"the group {name!r}", expected=listed)
 
 

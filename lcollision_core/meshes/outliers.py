@@ -62,13 +62,15 @@ def outlier_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, P
     lengths = np.array([topology.edge_lengths(vertices[pose]) for pose in some])
     # Not the mean of the middle two, which could mix a right length with a wrong one.
     middle = (len(some) - 1) // 2
-    known = lengths[0] if len(some) == 2 else np.partition(lengths, middle, axis=0)[middle]
+    reference_lengths = (
+        lengths[0] if len(some) == 2 else np.partition(lengths, middle, axis=0)[middle]
+    )
     defects = {}
     for pose, mesh in enumerate(vertices):
-        own = topology.edge_lengths(mesh)
-        scale = scale_of(own, known)
+        mesh_lengths = topology.edge_lengths(mesh)
+        scale = scale_of(mesh_lengths, reference_lengths)
         if scale is None:
-            if is_torn(own, known):
+            if is_torn(mesh_lengths, reference_lengths):
                 defects[pose] = PoseSetError(
                     "joins other vertices by edges than the other poses do, as if in another order",
                     "export it with the set's vertex order",

@@ -110,19 +110,19 @@ def joint_labels(
     -------
     J printable names
     """
-    own = part_names(names) if parts is None else parts
+    part_of_joint = part_names(names) if parts is None else parts
     labels: list[str] = []
-    known: list[bool] = []
+    is_named: list[bool] = []
     for joint, (name, parent) in enumerate(zip(names, parents.tolist(), strict=True)):
-        inherits = own[joint] is None and parent >= 0 and known[parent]
-        labels.append(own[joint] or (labels[parent] if inherits else _spelled_out(name)))
-        known.append(own[joint] is not None or inherits)
+        inherits = part_of_joint[joint] is None and parent >= 0 and is_named[parent]
+        labels.append(part_of_joint[joint] or (labels[parent] if inherits else _spelled_out(name)))
+        is_named.append(part_of_joint[joint] is not None or inherits)
     if len(set(labels)) > _MOST_PARTS:
         n_children = np.bincount(parents[parents >= 0], minlength=len(parents))
         for joint, parent in enumerate(parents.tolist()):
-            if not known[joint] and parent >= 0 and n_children[parent] == 1:
+            if not is_named[joint] and parent >= 0 and n_children[parent] == 1:
                 labels[joint] = labels[parent]
-    if len(set(labels)) == 1 and not any(known):
+    if len(set(labels)) == 1 and not any(is_named):
         every = -(-len(names) // _MOST_PARTS)
         labels = [_printable(names[joint // every * every]) for joint in range(len(names))]
     return tuple(labels)

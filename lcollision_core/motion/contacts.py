@@ -104,11 +104,11 @@ class KeptContacts:
 
     def without_touches(self, numbers: Mapping[int, Sequence[int]]) -> KeptContacts:
         """Return the contacts without some touches, given by frame."""
-        kept = (
+        remaining_touches = (
             [touch for number, touch in enumerate(own) if number not in numbers.get(at, ())]
             for at, own in enumerate(self.touches)
         )
-        return replace(self, touches=list(kept))
+        return replace(self, touches=list(remaining_touches))
 
     @cached_property
     def _level(self) -> FloatArray:

@@ -148,9 +148,9 @@ class Frames:
             for end_check, row in zip(ends, (start, end), strict=True)
         )
         first, second = meshes
-        own, place = (1.0 - share) * first + share * second, check.placement
-        own = own if place is None else place.inverse().apply(own)
-        shaped = check.space.shaped_as(codes, own.astype(np.float64) / check.body_size)
+        blended_codes, place = (1.0 - share) * first + share * second, check.placement
+        blended_codes = blended_codes if place is None else place.inverse().apply(blended_codes)
+        shaped = check.space.shaped_as(codes, blended_codes.astype(np.float64) / check.body_size)
         return self._separated(replace(check, space=shaped), codes)
 
     def are_free(self, frames: range, job: Job = UNWATCHED) -> npt.NDArray[np.bool_]:
@@ -455,17 +455,17 @@ def screen_frames(
 
     def screened_block(frames: range) -> list[FrameCollisions | None]:
         left = [at for at in frames if estimated_free is None or not estimated_free[at]]
-        asked = [at for at in left if not is_searched(at)] if measure is None else []
-        if collide is not None and asked:
-            free = set(np.compress(~collide(asked, 0.0), asked).tolist())
+        frames_to_measure = [at for at in left if not is_searched(at)] if measure is None else []
+        if collide is not None and frames_to_measure:
+            free = set(np.compress(~collide(frames_to_measure, 0.0), frames_to_measure).tolist())
             left = [at for at in left if at not in free]
         return [screened(at) if at in left else None for at in frames]
 
     def screened(frame: int) -> FrameCollisions | None:
         job.check()
         vertices = mesh(frame, 0.0)
-        own = None if seen is None else seen(range(frame, frame + 1))
-        collisions = (find if own is None else own.find)(
+        frame_vertices = None if seen is None else seen(range(frame, frame + 1))
+        collisions = (find if frame_vertices is None else frame_vertices.find)(
             vertices, counted_only=not is_searched(frame)
         )
         if is_searched(frame):
@@ -473,7 +473,9 @@ def screen_frames(
             searched[frame] = FrameExclusions(
                 frame, float(times[frame]), collisions.excluded, deepest
             )
-        nearest_of = measure if own is None or measure is None else own.least_distance
+        nearest_of = (
+            measure if frame_vertices is None or measure is None else frame_vertices.least_distance
+        )
         if nearest_of is not None and (pair := nearest_of(vertices)) is not None:
             nearest[frame] = pair.distance
         if not collisions.colliding:
@@ -588,8 +590,8 @@ def contact_report(motion: Motion, check: ExactCheck) -> ContactReport | None:
         return None
 
     def decoded(frame: int) -> FloatArray:
-        own = motion.space(frame, check.space)
-        vertices: FloatArray = own.decode(motion.codes[frame][None])[0]
+        frame_space = motion.space(frame, check.space)
+        vertices: FloatArray = frame_space.decode(motion.codes[frame][None])[0]
         return vertices
 
     return ContactReport.of(contacts, decoded, check.space)
@@ -694,16 +696,16 @@ class Guard:
         free : (n,) bool, set for the frames of the span
         fractions : for each frame, fractions of the way to the next of the poses to check
         """
-        own = [at % self.n for at in span]
+        frame_numbers = [at % self.n for at in span]
         reasons: dict[int, Reason] = {}
-        judged = self.frames.pool.map(lambda at: self._judge(at, codes[at]), own)
-        for at, (is_free, reason) in zip(own, judged, strict=True):
+        judged = self.frames.pool.map(lambda at: self._judge(at, codes[at]), frame_numbers)
+        for at, (is_free, reason) in zip(frame_numbers, judged, strict=True):
             free[at] = is_free
             if reason is not None:
                 reasons[at] = reason
         last = len(self.frames.motion) - 1
         pairs = [at % self.n for at in range(span.start - 1, span.stop)]
-        asked = [
+        frames_to_check = [
             at
             for at in pairs
             if at < last and self.was_clear[at] and free[at] and free[(at + 1) % self.n]
@@ -716,7 +718,9 @@ class Guard:
                 for share in fractions[at].tolist()
             )
 
-        for at, hit in zip(asked, self.frames.pool.map(collides, asked), strict=True):
+        for at, hit in zip(
+            frames_to_check, self.frames.pool.map(collides, frames_to_check), strict=True
+        ):
             if hit:
                 reasons.setdefault(at, Reason.BETWEEN)
         return reasons
@@ -746,20 +750,24 @@ class Guard:
         codes : (n, D) of the result
         reasons : known reasons, by frame
         """
-        own = [at % self.n for at in run]
+        frame_numbers = [at % self.n for at in run]
         was = self.frames.motion.codes
-        is_original = all(np.array_equal(codes[at], was[at]) for at in own)
-        deepest = self.frames.pool.map(lambda at: self._overlap(at, codes[at]).deepest, own)
-        depth, worst = max(zip(deepest, own, strict=True))
+        is_original = all(np.array_equal(codes[at], was[at]) for at in frame_numbers)
+        deepest = self.frames.pool.map(
+            lambda at: self._overlap(at, codes[at]).deepest, frame_numbers
+        )
+        depth, worst = max(zip(deepest, frame_numbers, strict=True))
         if depth == 0.0 and not is_original:
             return None
         overlap = self._overlap(worst, codes[worst])
         space = self.frames.resolver.check.space
-        reason = next((reasons[at] for at in own if at in reasons), Reason.NOT_FOUND)
+        reason = next((reasons[at] for at in frame_numbers if at in reasons), Reason.NOT_FOUND)
         if overlap.colliding and self._is_carried(worst, codes[worst]):
             reason = Reason.NO_JOINT
         parts = colliding_domains(overlap, space.vertex_domain, space.topology.faces)
-        return KeptSpan((own[0], own[-1]), reason, parts, overlap.deepest, is_original)
+        return KeptSpan(
+            (frame_numbers[0], frame_numbers[-1]), reason, parts, overlap.deepest, is_original
+        )
 
     def _is_carried(self, at: int, codes: FloatArray) -> bool:
         """Whether no motion of the joints opens the deepest contact of a pose much."""

@@ -57,26 +57,29 @@ class GroundReport:
         level = np.eye(3) - np.outer(axis, axis)
         worst = dict.fromkeys(("sink", "gap", "slide"), (0.0, 0))
         # For each standing part, the vertices of its sole and where their mean was at first.
-        held: dict[int, tuple[npt.NDArray[np.intp], FloatArray]] = {}
+        standing_vertices: dict[int, tuple[npt.NDArray[np.intp], FloatArray]] = {}
         n_standing = 0
         for frame, vertices in enumerate(placed_frames(motion, check)):
             heights = vertices @ axis - ground
-            found = [("sink", -float(heights[stands].min()))]
+            worst_values = [("sink", -float(heights[stands].min()))]
             parts = np.flatnonzero(standing[frame]).tolist()
-            own = {part: np.flatnonzero(domain == part) for part in parts}
-            own = {part: rows for part, rows in own.items() if len(rows)}
-            n_standing += bool(own)
-            held = {part: place for part, place in held.items() if part in own}
-            for part, rows in own.items():
+            vertices_of_part = {part: np.flatnonzero(domain == part) for part in parts}
+            vertices_of_part = {part: rows for part, rows in vertices_of_part.items() if len(rows)}
+            n_standing += bool(vertices_of_part)
+            standing_vertices = {
+                part: place for part, place in standing_vertices.items() if part in vertices_of_part
+            }
+            for part, rows in vertices_of_part.items():
                 lowest = float(heights[rows].min())
-                found.append(("gap", lowest))
-                if part not in held:
+                worst_values.append(("gap", lowest))
+                if part not in standing_vertices:
                     sole = rows[heights[rows] <= max(lowest, 0.0) + _SOLE]
-                    held[part] = sole, level @ vertices[sole].mean(axis=0)
-                sole, place = held[part]
+                    standing_vertices[part] = sole, level @ vertices[sole].mean(axis=0)
+                sole, place = standing_vertices[part]
                 moved = level @ vertices[sole].mean(axis=0) - place
-                found.append(("slide", float(np.linalg.norm(moved))))
-            for name, value in found:
+                worst_values.append(("slide", float(np.linalg.norm(moved))))
+            for name, value in worst_values:
                 worst[name] = max(worst[name], (value, frame), key=lambda one: one[0])
-        told = {f"{name}_frame": frame for name, (_, frame) in worst.items()}
-        return cls(n_standing, **{name: value for name, (value, _) in worst.items()}, **told)  # type: ignore[arg-type]
+        depths = {name: value for name, (value, _) in worst.items()}
+        frames = {f"{name}_frame": frame for name, (_, frame) in worst.items()}
+        return cls(n_standing, **depths, **frames)  # type: ignore[arg-type]

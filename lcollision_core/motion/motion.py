@@ -104,26 +104,26 @@ class Motion:
 
     def two_turns(self) -> Motion:
         """Return two turns of a cycle, without the frame that repeats the first."""
-        n, own, hidden = len(self) - 1, self.space_at, self.hidden
+        n, frame_space, hidden = len(self) - 1, self.space_at, self.hidden
         turn = self.times[:-1]
         return replace(
             self,
             times=np.concatenate([turn, turn + (self.times[-1] - self.times[0])]),
             codes=np.tile(self.codes[:-1], (2, 1)),
             placements=None if self.placements is None else self.placements[:-1] * 2,
-            space_at=None if own is None else lambda time: own(time % n),
+            space_at=None if frame_space is None else lambda time: frame_space(time % n),
             hidden=None if hidden is None else lambda frame: hidden(frame % n),
             contacts=self._contacts_at([*range(n)] * 2),
         )
 
     def _contacts_at(self, frames: Sequence[int]) -> Callable[[], KeptContacts | None] | None:
         """Return the `contacts` of a motion of some of the frames."""
-        own = self.contacts
-        if own is None:
+        contacts_at = self.contacts
+        if contacts_at is None:
             return None
 
         def chosen() -> KeptContacts | None:
-            contacts = own()
+            contacts = contacts_at()
             return None if contacts is None else contacts.at(frames)
 
         return chosen
@@ -138,14 +138,14 @@ class Motion:
 
     def part(self, frames: range) -> Motion:
         """Return the motion of some successive frames, at their times."""
-        own, hidden = self.space_at, self.hidden
-        chosen = slice(frames.start, frames.stop)
+        frame_space, hidden = self.space_at, self.hidden
+        rows = slice(frames.start, frames.stop)
         return replace(
             self,
-            times=self.times[chosen],
-            codes=np.array(self.codes[chosen]),
-            placements=None if self.placements is None else self.placements[chosen],
-            space_at=None if own is None else lambda time: own(time + frames.start),
+            times=self.times[rows],
+            codes=np.array(self.codes[rows]),
+            placements=None if self.placements is None else self.placements[rows],
+            space_at=None if frame_space is None else lambda time: frame_space(time + frames.start),
             hidden=None if hidden is None else lambda frame: hidden(frame + frames.start),
             contacts=self._contacts_at(frames),
         )
@@ -161,7 +161,7 @@ class Motion:
         if len(self) == n and np.allclose(times, self.times, rtol=0.0, atol=1e-6):
             return self
         nearest = np.searchsorted(0.5 * (self.times[1:] + self.times[:-1]), times)
-        own, placements, hidden = self.space_at, self.placements, self.hidden
+        frame_space, placements, hidden = self.space_at, self.placements, self.hidden
         codes, at = np.array(self.codes[nearest]), nearest.astype(np.float64)
         if placements is None:
             codes = np.array([np.interp(times, self.times, row) for row in self.codes.T]).T
@@ -172,8 +172,8 @@ class Motion:
             codes=codes,
             placements=None if placements is None else tuple(placements[at] for at in nearest),
             space_at=None
-            if own is None
-            else lambda time: own(float(np.interp(time, np.arange(n), at))),
+            if frame_space is None
+            else lambda time: frame_space(float(np.interp(time, np.arange(n), at))),
             hidden=None if hidden is None else lambda frame: hidden(int(nearest[frame])),
             contacts=self._contacts_at(nearest.tolist()),
         )
@@ -190,8 +190,8 @@ class Motion:
         share : fraction of the way to the next frame
         """
         space = self.space(frame + share, check.space)
-        own = replace(check, space=space, placement=self.placement(frame))
-        return self.seen(own, range(frame, frame + 1 + (share > 0.0)))
+        frame_check = replace(check, space=space, placement=self.placement(frame))
+        return self.seen(frame_check, range(frame, frame + 1 + (share > 0.0)))
 
     def seen(self, check: ExactCheck, frames: range) -> ExactCheck:
         """Return a check without the faces that any of the frames hides."""
@@ -201,8 +201,8 @@ class Motion:
 
     def drawn(self, frame: int, check: ExactCheck) -> npt.NDArray[np.float32]:
         """Return the (V, 3) vertices of a frame as they are drawn, in model coordinates."""
-        own = self.check(frame, check)
-        return own.drawn(own.decode(self.codes[frame])[0])
+        frame_check = self.check(frame, check)
+        return frame_check.drawn(frame_check.decode(self.codes[frame])[0])
 
     def vertices(
         self, frame: int, check: ExactCheck, share: float = 0.0
@@ -218,8 +218,8 @@ class Motion:
         if share and self.placements is None:
             codes = (1.0 - share) * codes + share * self.codes[frame + 1]
         if share == 0.0 or self.placements is None:
-            own = self.check(frame, check, share)
-            return own.exported(own.decode(codes)[0])
+            frame_check = self.check(frame, check, share)
+            return frame_check.exported(frame_check.decode(codes)[0])
         between = (1.0 - share) * self.vertices(frame, check)
         between += share * self.vertices(frame + 1, check)
         return between

@@ -40,8 +40,8 @@ def colliding_on_gpu(
         return None
     if codes[:, codes.shape[1] - space.n_shapes :].any():
         return None
-    own: Any = space
-    decoder = _decoder_of(own, body_size)
+    posed_space: Any = space
+    decoder = _decoder_of(posed_space, body_size)
     if decoder is None:
         return None
     from lcollision_core.on_gpu import GPU_LOCK

@@ -195,17 +195,17 @@ class LatentPoseSpace:
             return self._origin.domain_metrics
         embedding = self.embedding
         latent, size = embedding.training_latent, embedding.latent_size
-        chosen = np.unique(np.linspace(0, len(latent) - 1, _JACOBIAN_POSES).astype(int))
+        pose_numbers = np.unique(np.linspace(0, len(latent) - 1, _JACOBIAN_POSES).astype(int))
         led = [self.vertex_domain == domain for domain in range(self.n_domains)]
         gram = np.zeros((self.n_domains, size, size))
-        for row in latent[chosen]:
+        for row in latent[pose_numbers]:
             features = embedding.decoder.features(row[None])[0]
             tangents = embedding.decoder.tangents(row)
             moved = embedding.codec.decode_jvp(features, tangents, n_threads=1)
             for domain, inside in enumerate(led):
                 by_code = moved[:, inside].reshape(size, -1)
                 gram[domain] += by_code @ by_code.T
-        gram /= len(chosen) * embedding.topology.n_vertices
+        gram /= len(pose_numbers) * embedding.topology.n_vertices
         return DisplacementMetrics(size, [np.arange(size)] * self.n_domains, tuple(gram))
 
     @property
@@ -225,8 +225,8 @@ class LatentPoseSpace:
     def longest_edges(self) -> FloatArray:
         """(E,) float64 array, the longest length of each edge in the training poses."""
         if self._origin is not None and self._shown is not None:
-            own = self.topology.edge_lengths(self._shown)
-            return np.maximum(self._origin.longest_edges, own)
+            shown_lengths = self.topology.edge_lengths(self._shown)
+            return np.maximum(self._origin.longest_edges, shown_lengths)
         longest = np.zeros(len(self.topology.edges))
         for row in self.embedding.training_latent:
             lengths = self.topology.edge_lengths(self.decode(row[None])[0])

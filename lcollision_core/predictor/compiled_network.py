@@ -46,13 +46,13 @@ def farthest_points(positions: FloatArray, first: int, n_points: int) -> npt.NDA
 
     Once all are chosen, the first is repeated.
     """
-    chosen = [first]
+    points = [first]
     nearest = np.linalg.norm(positions - positions[first], axis=1)
-    while len(chosen) < n_points:
+    while len(points) < n_points:
         best = int(nearest.argmax())
-        chosen.append(best)
+        points.append(best)
         nearest = np.minimum(nearest, np.linalg.norm(positions - positions[best], axis=1))
-    return np.array(chosen)
+    return np.array(points)
 
 
 def neighbour_order(positions: FloatArray, block: int) -> npt.NDArray[np.int32]:
@@ -66,8 +66,8 @@ def neighbour_order(positions: FloatArray, block: int) -> npt.NDArray[np.int32]:
         n_blocks = -(-len(index) // block)
         if n_blocks < 2:
             return [index]
-        own = positions[index]
-        along = own[:, np.ptp(own, axis=0).argmax()].argsort(kind="stable")
+        vertex_position = positions[index]
+        along = vertex_position[:, np.ptp(vertex_position, axis=0).argmax()].argsort(kind="stable")
         half = n_blocks // 2 * block
         return ordered(index[along[:half]]) + ordered(index[along[half:]])
 
@@ -202,8 +202,8 @@ class SkinGeometry:
         groups, targets, code = [], [], 0
         for group in embedding.decoder.groups:
             n_codes = len(group.weights)
-            _, moved, own = np.intersect1d(skin, group.support, return_indices=True)
-            weights = group.weights.reshape(n_codes, -1, N_FEATURES)[:, own]
+            _, moved, support_rows = np.intersect1d(skin, group.support, return_indices=True)
+            weights = group.weights.reshape(n_codes, -1, N_FEATURES)[:, support_rows]
             table = np.ascontiguousarray(weights.reshape(n_codes, -1), dtype=np.float32)
             groups.append(CodeGroup(slice(code, code + n_codes), table))
             targets.append(moved)
@@ -276,8 +276,10 @@ class CompiledSkin:
         frame = empty("frame", n_rows, *geometry.rest_frame.shape)
         rows = empty("rows", n_rows, 3, n_skin, 3)
         kernels.deform(features, turns, geometry.rest_frame, frame, rows)
-        own = rows[:, :, : geometry.n_points].reshape(3 * n_rows, -1)
-        moved = np.matmul(own, self._weight, out=empty("moved", 3 * n_rows, geometry.n_points))
+        point_rows = rows[:, :, : geometry.n_points].reshape(3 * n_rows, -1)
+        moved = np.matmul(
+            point_rows, self._weight, out=empty("moved", 3 * n_rows, geometry.n_points)
+        )
         positions = moved.reshape(n_rows, 3, -1) + self._origin
         field = empty("field", geometry.n_points, n_rows, *UNITS.shape)
         kernels.contact_field(frame, positions, geometry.order, geometry.neighbour_blocks, field)

@@ -357,10 +357,12 @@ class ReducedBody(nn.Module):
         inputs : (S, B, 9 M) the members' gradients R S in the frame of each site's first member
         """
         (n_sites, n_members), n_rows = self.members.shape, len(frame)
-        own = frame.index_select(1, self.members[:, 0]).transpose(2, 3).flatten(0, 1)
-        taken = gradients.index_select(2, self.members.flatten())
-        taken = taken.view(n_rows, 3, n_sites, 3 * n_members).transpose(1, 2).flatten(0, 1)
-        local = (own @ taken).view(n_rows, n_sites, 3, n_members, 3)
+        member_frame = frame.index_select(1, self.members[:, 0]).transpose(2, 3).flatten(0, 1)
+        member_gradients = gradients.index_select(2, self.members.flatten())
+        member_gradients = (
+            member_gradients.view(n_rows, 3, n_sites, 3 * n_members).transpose(1, 2).flatten(0, 1)
+        )
+        local = (member_frame @ member_gradients).view(n_rows, n_sites, 3, n_members, 3)
         inputs: torch.Tensor = local.permute(1, 0, 3, 2, 4).flatten(2)
         return inputs
 
@@ -595,28 +597,28 @@ class GeometricNetwork(PredictorNetwork):
         margin: float,  # noqa: ARG002
     ) -> torch.Tensor:
         """Return this process's share of the batch's mean loss, with patches, without ranking."""
-        own = batch.part(*part)
-        if not len(own.energy):
+        row_batch = batch.part(*part)
+        if not len(row_batch.energy):
             # The mean of no rows is NaN; their sum is 0, and depends on the parameters.
             return output.logit.sum()
-        fraction = len(own.energy) / len(batch.energy)
+        fraction = len(row_batch.energy) / len(batch.energy)
         patch_logit, patch_root, root = output.auxiliary
         total = config.entropy_weight * binary_cross_entropy_with_logits(
-            output.logit, own.colliding
+            output.logit, row_batch.colliding
         )
         n_patches = self.skin.n_points
         for cells, weight, depth_weight in (
             (slice(0, n_patches), _PATCH_WEIGHT, _DEPTH_WEIGHT),
             (slice(n_patches, None), _FOLD_WEIGHT, _FOLD_DEPTH_WEIGHT),
         ):
-            taught = own.patch_root[:, cells]
+            taught = row_batch.patch_root[:, cells]
             if taught.shape[1]:
                 colliding = (taught > 0.0).to(patch_logit)
                 total = total + weight * binary_cross_entropy_with_logits(
                     patch_logit[:, cells], colliding
                 )
                 total = total + depth_weight * smooth_l1_loss(patch_root[:, cells], taught)
-        labelled = torch.cat([own.domain_energy, own.energy[:, None]], dim=1).sqrt()
+        labelled = torch.cat([row_batch.domain_energy, row_batch.energy[:, None]], dim=1).sqrt()
         total = total + config.depth_weight * smooth_l1_loss(root, labelled)
         return fraction * total
 

@@ -162,19 +162,21 @@ class PaperNetwork(PredictorNetwork):
         margin: float,
     ) -> torch.Tensor:
         """Return this process's share of the batch's mean loss: the paper's three terms."""
-        own = batch.part(*part)
+        row_batch = batch.part(*part)
         n_rows = len(batch.energy)
         total = (
             config.entropy_weight
             / n_rows
-            * binary_cross_entropy_with_logits(output.logit, own.colliding, reduction="sum")
+            * binary_cross_entropy_with_logits(output.logit, row_batch.colliding, reduction="sum")
         )
         if config.depth_weight:
-            divided = own.domain_energy if config.by_domain else own.domain_energy[:, :0]
-            losses = depth_loss(output.domain_energy, divided, own.energy)
+            divided = (
+                row_batch.domain_energy if config.by_domain else row_batch.domain_energy[:, :0]
+            )
+            losses = depth_loss(output.domain_energy, divided, row_batch.energy)
             total = total + config.depth_weight / n_rows * losses.sum()
         if config.rank_weight:
-            losses = rank_loss(output.domain_energy.sum(dim=1), own.energy, margin)
+            losses = rank_loss(output.domain_energy.sum(dim=1), row_batch.energy, margin)
             n_pairs = max(ranked_pairs(batch.energy), 1)
             total = total + config.rank_weight / n_pairs * losses.sum()
         return total

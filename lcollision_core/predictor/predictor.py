@@ -210,10 +210,12 @@ class CollisionPredictor:
         """
         logit = self.scaled_outputs(latent)[1]
         measured = () if self.metrics is None else self.metrics.sure
-        kept = [sure_range for sure_range in measured if sure_range.error_bound <= error_bound]
-        if not kept:
+        accepted_ranges = [
+            sure_range for sure_range in measured if sure_range.error_bound <= error_bound
+        ]
+        if not accepted_ranges:
             return np.zeros(len(logit), dtype=np.bool_), np.zeros(len(logit), dtype=np.bool_)
-        return logit < kept[-1].free_below, logit > kept[-1].colliding_above
+        return logit < accepted_ranges[-1].free_below, logit > accepted_ranges[-1].colliding_above
 
     def scaled_outputs(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Return the network's outputs: scaled energies, maybe below 0, and the shifted logit.

@@ -121,19 +121,19 @@ def joined_processes(device: str) -> Iterator[Processes]:
         )
     backend = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
     local_rank = int(os.environ.get("LOCAL_RANK", "0"))
-    chosen = torch.device(
+    process_device = torch.device(
         backend, local_rank % torch.cuda.device_count() if backend == "cuda" else 0
     )
     if not dist.is_torchelastic_launched():
         yield Processes(0, 1, torch.device(backend))
         return
     if backend == "cuda":
-        torch.cuda.set_device(chosen)
+        torch.cuda.set_device(process_device)
     own_group = not dist.is_initialized()
     if own_group:
         dist.init_process_group("nccl" if backend == "cuda" else "gloo")
     try:
-        yield Processes(dist.get_rank(), dist.get_world_size(), chosen)
+        yield Processes(dist.get_rank(), dist.get_world_size(), process_device)
     finally:
         if own_group:
             dist.destroy_process_group()
@@ -367,23 +367,23 @@ class TrainingLoop:
         cells = network.skin_cells(self.embedding)
         if cells is None:
             return np.empty((n_rows, 0), dtype=np.float16)
-        kept = Checkpoint(self._patches_path, key)
+        checkpoint = Checkpoint(self._patches_path, key)
         roots = np.zeros((n_rows, cells.n_patches + cells.n_folds), dtype=np.float16)
-        stored = kept.get(_PATCHES)
-        known = roots[:0] if stored is None else stored.arrays["root"]
-        processes.require_same(len(known))
-        if len(known) == n_rows:
-            return known
-        roots[: len(known)] = known
+        stored = checkpoint.get(_PATCHES)
+        stored_roots = roots[:0] if stored is None else stored.arrays["root"]
+        processes.require_same(len(stored_roots))
+        if len(stored_roots) == n_rows:
+            return stored_roots
+        roots[: len(stored_roots)] = stored_roots
         labeller = PatchLabeller(
             self.embedding, self.rows, cells, self.facts.energy_scale, self._rules, self.groups
         )
         step = max(-(-n_rows // _TIMES_PATCHES_KEPT), _LEAST_PATCHES_KEPT)
-        for start in range(len(known), n_rows, step):
+        for start in range(len(stored_roots), n_rows, step):
             part = roots[start : start + step]
             self._label_patches(labeller, start, part, processes)
             if processes.rank == 0:
-                kept.put(_PATCHES, {"root": roots[: start + len(part)]}, {})
+                checkpoint.put(_PATCHES, {"root": roots[: start + len(part)]}, {})
         return roots
 
     def _label_patches(
@@ -499,8 +499,8 @@ class TrainingLoop:
             return 0
         states: dict[str, dict[str, Tensor]] = {_NETWORK: {}, _AVERAGE: {}, _OPTIMISER: {}}
         for name, array in stored.arrays.items():
-            prefix, own = name.split(":", 1)
-            states[f"{prefix}:"][own] = torch.tensor(array)
+            prefix, array_name = name.split(":", 1)
+            states[f"{prefix}:"][array_name] = torch.tensor(array)
         network.load_state_dict(states[_NETWORK])
         if self._average is not None:
             self._average.load_state_dict(states[_AVERAGE])

@@ -253,8 +253,8 @@ class Ladder:
             return found, step, None
         if found is not None and self._nearer is not None and least.is_within(self._nearer):
             return self._lifted(self._nearer, least)[0], step, FEET_MOVED
-        known = np.where(self.problem.movable, self.free_latents, self.problem.target)
-        nearest = known[np.argsort(self.problem.distance(known), kind="stable")]
+        starts = np.where(self.problem.movable, self.free_latents, self.problem.target)
+        nearest = starts[np.argsort(self.problem.distance(starts), kind="stable")]
         latent = least.find([*([] if found is None else [found]), *nearest])
         latent, sunk = self._lifted(latent, least)
         if self.check.is_free(latent):
@@ -328,12 +328,14 @@ class Ladder:
     def _by_restarts(self) -> Iterator[_Tried]:
         """Restart halfway between Z* and known free poses, and at random poses near Z*."""
         problem = self.problem
-        known = np.where(problem.movable, self.free_latents, problem.target)
-        order = np.argsort(problem.search_distance(known), kind="stable")[:_KNOWN_STARTS]
+        known_starts = np.where(problem.movable, self.free_latents, problem.target)
+        order = np.argsort(problem.search_distance(known_starts), kind="stable")[:_KNOWN_STARTS]
         generator = np.random.default_rng(self.options.seed)
         span = problem.high - problem.low
         moves = generator.uniform(-_SPREAD, _SPREAD, (_RANDOM_STARTS, len(span))) * span
-        starts = np.concatenate([0.5 * (problem.target + known[order]), problem.target + moves])
+        starts = np.concatenate(
+            [0.5 * (problem.target + known_starts[order]), problem.target + moves]
+        )
         margin = START_MARGIN + self._margin
         if self.options.solver == Solver.SQP:
             batch = SqpBatch(problem, starts, np.full(len(starts), margin))
@@ -560,8 +562,8 @@ class PoseResolver:
         LCollisionError : an unknown locked domain, or neither a predictor nor the exact check.
         CancelledError : the job was cancelled.
         """
-        chosen = options or ResolveOptions()
-        if self._predictor is None and not chosen.verify:
+        resolve_options = options or ResolveOptions()
+        if self._predictor is None and not resolve_options.verify:
             raise LCollisionError(
                 "has no predictor, so its answer can't be left unchecked",
                 "resolve with the exact check",
@@ -577,21 +579,21 @@ class PoseResolver:
         remark = f"{outside} of {len(target)} {what} {verb} outside {kind}"
         earlier = None if before is None or self._predictor is not None else self._checked(before)
         standing = None
-        if chosen.standing is not None:
-            standing = Standing.of(self.check, target, np.array(chosen.standing))
+        if resolve_options.standing is not None:
+            standing = Standing.of(self.check, target, np.array(resolve_options.standing))
             if not self._space.limbs.is_relative:
                 # Nothing else keeps the standing parts in place.
-                still = chosen.still_domains | standing.domains(self.check)
-                chosen = replace(chosen, still_domains=still)
+                still = resolve_options.still_domains | standing.domains(self.check)
+                resolve_options = replace(resolve_options, still_domains=still)
 
         def known_free() -> FloatArray:
-            known = self._known_free(target)
-            return known if earlier is None else np.concatenate([earlier[None], known])
+            free_poses = self._known_free(target)
+            return free_poses if earlier is None else np.concatenate([earlier[None], free_poses])
 
         ladder = Ladder(
-            self.problem(target, chosen, job),
-            replace(self.check.with_clearance(chosen.clearance), placement=placement),
-            chosen,
+            self.problem(target, resolve_options, job),
+            replace(self.check.with_clearance(resolve_options.clearance), placement=placement),
+            resolve_options,
             known_free,
             None if near is None else self._checked(near),
             job,
@@ -600,7 +602,7 @@ class PoseResolver:
             standing,
         )
         with single_torch_thread():
-            return ladder.climb() if chosen.verify else ladder.solve_only()
+            return ladder.climb() if resolve_options.verify else ladder.solve_only()
 
     def _known_free(self, target: FloatArray) -> FloatArray:  # noqa: ARG002
         """Return (F, D) poses known to be free, for a (D,) target."""
@@ -647,14 +649,14 @@ class PoseResolver:
         placed = [None] * len(rows) if placements is None else placements
         # Build the cached parts before threads use them.
         _ = self._space.metric, self._space.decode(np.zeros((1, len(self._low))))
-        known = done or {}
+        known_results = done or {}
         results: dict[int, ResolveResult] = {}
         guard = Lock()
 
         def solve(run: range) -> None:
             near = before = None
             for index in run:
-                result = known.get(index) or self.resolve(
+                result = known_results.get(index) or self.resolve(
                     rows[index], options, job.part(), placed[index], near, before
                 )
                 if sequence:
@@ -662,7 +664,7 @@ class PoseResolver:
                     before = result.latent if result.exactly_free else None
                 with guard:
                     results[index] = result
-                    if keep is not None and index not in known:
+                    if keep is not None and index not in known_results:
                         keep(index, result)
                     job.report(len(results), len(rows))
 
@@ -775,10 +777,10 @@ def find_free_poses(embedding: Embedding, check: ExactCheck) -> FloatArray:
         thousand poses is free.
     """
     training = embedding.training_latent.astype(np.float64)
-    chosen = evenly_spaced(len(training), MOST_POSES - 1)
+    pose_numbers = evenly_spaced(len(training), MOST_POSES - 1)
     sources = chain(
-        [np.concatenate([np.zeros((1, embedding.latent_size)), training[chosen]])],
-        (factor * training[chosen] for factor in _SHRINKINGS),
+        [np.concatenate([np.zeros((1, embedding.latent_size)), training[pose_numbers]])],
+        (factor * training[pose_numbers] for factor in _SHRINKINGS),
         (embedding.box.draw(0, block).astype(np.float64) for block in range(SEARCHED_BLOCKS)),
     )
     free_poses: list[FloatArray] = []

@@ -536,12 +536,12 @@ class Standing:
         """
         heights = decoded @ self.up
         lowest = int(heights.argmin())
-        chosen = np.append(self.points, lowest)
+        standing_points = np.append(self.points, lowest)
         raised = decoded[lowest] + max(0.0, self._ground - heights[lowest]) * self.up
         places = np.concatenate([self.decoded[self.points], raised[None]])
-        away = np.linalg.norm(places - decoded[chosen], axis=1)
+        away = np.linalg.norm(places - decoded[standing_points], axis=1)
         first = int(away.argmax())
-        return (int(chosen[first]) if away[first] > _NEAR else -1), places[first]
+        return (int(standing_points[first]) if away[first] > _NEAR else -1), places[first]
 
 
 def _shifted(

@@ -76,8 +76,8 @@ class OpenedCharacter:
         unknown = [name for name in joints if name not in numbers]
         if unknown:
             raise LCollisionError(f"has no joint {unknown[0]!r}", where=self.body.name)
-        chosen = np.isin(self.joints, [numbers[name] for name in joints])
-        return np.flatnonzero(chosen)
+        is_named = np.isin(self.joints, [numbers[name] for name in joints])
+        return np.flatnonzero(is_named)
 
     def turns(self, before: FloatArray, after: FloatArray) -> tuple[IntArray, FloatArray]:
         """Return how joints turn between the poses `before` and `after`, in their local frames.
@@ -94,18 +94,18 @@ class OpenedCharacter:
         turned = self._turned(before, after)
         limit = _SAME * np.array([1.0, 1.0, 1.0, self.body.body_size])
         does = (np.abs(turned - np.eye(4)) > limit).any(axis=(0, 2, 3))
-        chosen = np.flatnonzero(does & (self.joints < len(self.joint_names)))
-        return self.joints[chosen], turned[:, chosen]
+        joint_codes = np.flatnonzero(does & (self.joints < len(self.joint_names)))
+        return self.joints[joint_codes], turned[:, joint_codes]
 
     def _turned(self, before: FloatArray, after: FloatArray) -> FloatArray:
         """Return the (T, J, 4, 4) turns of all joints of the rig, as `turns` does."""
-        space, own = self.body.space, []
+        space, joint_turns = self.body.space, []
         parents = space.rig.own_parents
         for codes in (before, after):
             moved = np.array([space.transforms(row) for row in codes])
             above = np.where((parents < 0)[:, None, None], np.eye(4), moved[:, parents])
-            own.append(np.linalg.inv(above) @ moved)
-        turned: FloatArray = np.linalg.inv(own[0]) @ own[1]
+            joint_turns.append(np.linalg.inv(above) @ moved)
+        turned: FloatArray = np.linalg.inv(joint_turns[0]) @ joint_turns[1]
         return turned
 
     def without_small_turns(
@@ -243,21 +243,24 @@ def open_arrays(message: OpenMesh) -> OpenedCharacter:
 def _further(message: OpenMesh, character: Character) -> list[FaceGroup]:
     """Return the parts' groups of vertices as groups of faces, merged by name."""
     assert character.file is not None
-    corners, chosen, first = [], dict[str, list[IntArray]](), 0
+    corners, faces_of_group, first = [], dict[str, list[IntArray]](), 0
     for part in message.parts:
         n = part.vertices.shape[0]
         corners.append(part.faces.indices("faces", (None, 3), n) + first)
         for group in part.groups:
             vertices = group.vertices.indices(f"vertices of {group.name!r}", (None,), n)
-            chosen.setdefault(group.name, []).append(vertices + first)
+            faces_of_group.setdefault(group.name, []).append(vertices + first)
         first += n
     faces = np.concatenate(corners)[character.file.mesh.cut_of]
-    known = {group.name for group in character.groups}
-    inside = {name: np.isin(faces, np.concatenate(own)).all(axis=1) for name, own in chosen.items()}
+    group_names = {group.name for group in character.groups}
+    inside = {
+        name: np.isin(faces, np.concatenate(own)).all(axis=1)
+        for name, own in faces_of_group.items()
+    }
     return [
         FaceGroup(name, np.flatnonzero(own))
         for name, own in inside.items()
-        if own.any() and name not in known and name.strip()
+        if own.any() and name not in group_names and name.strip()
     ]
 
 

@@ -52,11 +52,11 @@ class FrameReader:
                 ahead = self._stream.peek()
                 if not ahead:
                     return None
-                seen = head + ahead
-                at = seen.find(MARK)
-                end = len(seen) if at < 0 else at + len(MARK)
+                received = head + ahead
+                at = received.find(MARK)
+                end = len(received) if at < 0 else at + len(MARK)
                 self._stream.read(end - len(head))
-                head = seen[:end][-len(MARK) :]
+                head = received[:end][-len(MARK) :]
             self._is_lost = False
         length = self._stream.read(_LENGTH.size)
         if len(length) < _LENGTH.size:

@@ -74,9 +74,9 @@ class Array(Struct, forbid_unknown_fields=True):
             for wanted, there in zip(shape, self.shape, strict=True)
         )
         if not fits:
-            wanted = " x ".join("any" if n is None else str(n) for n in shape)
+            shape_text = " x ".join("any" if n is None else str(n) for n in shape)
             got = " x ".join(map(str, self.shape)) or "a number"
-            raise LCollisionError.must_be(name, f"an array of shape {wanted}", got)
+            raise LCollisionError.must_be(name, f"an array of shape {shape_text}", got)
         dtype = np.dtype(self.dtype)
         if math.prod(self.shape) * dtype.itemsize != len(self.data):
             n_bytes = math.prod(self.shape) * dtype.itemsize

@@ -273,8 +273,8 @@ def _options(opened: OpenedCharacter, request: m.ResolvePose | m.ResolveMotion) 
 
 def propose(opened: OpenedCharacter, request: m.ProposeRules, job: Job) -> Reply:
     """Propose places to leave out of the check because they touch in nearly every pose."""
-    shown = None if request.vertices is None else opened.shown(request.vertices, None)
-    proposed = propose_rules(opened.body, job, shown)
+    shown_vertices = None if request.vertices is None else opened.shown(request.vertices, None)
+    proposed = propose_rules(opened.body, job, shown_vertices)
     if proposed is None:
         return {"touching": []}
     return {
@@ -304,7 +304,7 @@ def _motion(
         times, transforms = np.zeros(1), transforms[None]
         vertices = None if vertices is None else vertices[None]
     space, name = opened.body.space, opened.body.name
-    seen = (
+    vertices_of_frame = (
         {} if vertices is None else {n: partial(vertices.__getitem__, n) for n in range(len(times))}
     )
-    return motion_of_transforms(space, name, times, transforms, shown=seen)
+    return motion_of_transforms(space, name, times, transforms, shown=vertices_of_frame)

@@ -112,18 +112,18 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
         raise MeshFileError(what, "name a rest pose of this mesh", where=path)
     for remark in (*mesh.notes, *audit_mesh(mesh.topology, mesh.vertices)):
         job.note(f"{path}: {remark}")
-    known = None if request.no_rules or rest is not None else _known(path, mesh, job)
+    known_body = None if request.no_rules or rest is not None else _known(path, mesh, job)
     body: Body
     try:
-        if known is not None:
-            body, vertices = known[0], known[1]
+        if known_body is not None:
+            body, vertices = known_body[0], known_body[1]
         else:
             vertices, groups = mesh.vertices, _groups(path, mesh.topology, request)
             reference = vertices if rest is None else rest.vertices
             body = MeshBody(vertices[None], mesh.topology, reference, groups=groups)
         detector = _as_asked(body, request).detector
         rules, topology = detector.rules, detector.topology
-        rest_is_known = known is not None or rest is not None
+        rest_is_known = known_body is not None or rest is not None
         detector = detector.with_clearance(request.clearance, rest_is_known=rest_is_known)
         nearest = None
         if request.clearance > 0.0:
@@ -142,7 +142,7 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
             )
         )
     checked = _checked(str(path), topology, rules, collisions, nearest, request, start)
-    return replace(checked, rules_of=None if known is None else known[0].name)
+    return replace(checked, rules_of=None if known_body is None else known_body[0].name)
 
 
 def _check_scene(path: Path, request: CheckRequest, job: Job) -> CheckedMesh:
@@ -156,30 +156,42 @@ def _check_scene(path: Path, request: CheckRequest, job: Job) -> CheckedMesh:
     for part in scene.bodies:
         file = Path(part.file)
         mesh = read_mesh(file)
-        known: tuple[Body, npt.NDArray[np.float64]] | None = None
+        known_body: tuple[Body, npt.NDArray[np.float64]] | None = None
         if not request.no_rules:
-            known = _known(file, mesh, job)
-        if known is None and not request.no_rules and (rigged := open_rigged(file)) is not None:
+            known_body = _known(file, mesh, job)
+        if (
+            known_body is None
+            and not request.no_rules
+            and (rigged := open_rigged(file)) is not None
+        ):
             character = open_body(rigged)
-            known = (character, character.reference) if character.joints is not None else None
-        vertices = mesh.vertices if known is None else known[1]
-        body = MeshBody(vertices[None], mesh.topology, vertices) if known is None else known[0]
+            known_body = (character, character.reference) if character.joints is not None else None
+        vertices = mesh.vertices if known_body is None else known_body[1]
+        body = (
+            MeshBody(vertices[None], mesh.topology, vertices)
+            if known_body is None
+            else known_body[0]
+        )
         bodies.append(body)
         posed.append(vertices)
-    made = _as_asked(body_of_scene(scene, bodies, as_posed=True), request)
-    names = [member.name for member in made.members]
-    in_order = sorted(range(len(names)), key=lambda n: made.vertices_of[names[n]].start)
-    shown = [*posed, *(member.body.reference for member in made.members[len(posed) :])]
-    vertices = np.concatenate([made.members[n].place.apply(shown[n]) for n in in_order])
-    detector = made.detector.with_clearance(request.clearance)
+    scene_body = _as_asked(body_of_scene(scene, bodies, as_posed=True), request)
+    names = [member.name for member in scene_body.members]
+    in_order = sorted(range(len(names)), key=lambda n: scene_body.vertices_of[names[n]].start)
+    shown_meshes = [*posed, *(member.body.reference for member in scene_body.members[len(posed) :])]
+    vertices = np.concatenate(
+        [scene_body.members[n].place.apply(shown_meshes[n]) for n in in_order]
+    )
+    detector = scene_body.detector.with_clearance(request.clearance)
     nearest = None
     if request.clearance > 0.0:
         bound = max(DISTANCE_BOUND, request.clearance)
         nearest = detector.least_distance(vertices, bound)
     collisions = detector.summarise(vertices, n_deepest=_DEEPEST, job=job)
     files = " + ".join(part.file for part in scene.bodies)
-    checked = _checked(files, made.topology, detector.rules, collisions, nearest, request, start)
-    return replace(checked, parts=parts_text(made, collisions.pairs))
+    checked = _checked(
+        files, scene_body.topology, detector.rules, collisions, nearest, request, start
+    )
+    return replace(checked, parts=parts_text(scene_body, collisions.pairs))
 
 
 def _checked(
@@ -285,8 +297,8 @@ def _check_motions(
         verdict = _verdict(
             path, motion.name, motion.times, motion.rate, screened, names, rules, request
         )
-        kept = contact_report(motion, check)
-        contacts = None if kept is None else kept.to_json()
+        contacts_kept = contact_report(motion, check)
+        contacts = None if contacts_kept is None else contacts_kept.to_json()
         verdicts.append(
             replace(
                 verdict,

@@ -163,11 +163,11 @@ def source_files(model: Body, request: ExportRequest | None = None) -> list[Path
     """Return the user's files that a body, and the form of its exports, come from."""
     from lcollision_core.bodies import as_scene
 
-    own, scene = [None if request is None else request.like, model.own_file], as_scene(model)
+    files, scene = [None if request is None else request.like, model.own_file], as_scene(model)
     if scene is not None:
-        own += [member.body.own_file for member in scene.members]
-        own += [Path(scene.file.path)] if scene.file is not None and scene.file.path else []
-    return [path for path in own if path is not None]
+        files += [member.body.own_file for member in scene.members]
+        files += [Path(scene.file.path)] if scene.file is not None and scene.file.path else []
+    return [path for path in files if path is not None]
 
 
 def files_of(

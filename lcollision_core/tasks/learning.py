@@ -110,7 +110,7 @@ def estimated_seconds(
     effort = EFFORTS[quality]
     share = 2.0 / (available_cores() if n_cores is None else n_cores)
     rows = int(_TRAINING_SHARE * effort.n_samples)
-    shown = rows * effort.predictor.passes(rows)
+    n_passes = rows * effort.predictor.passes(rows)
     row = 3.5e-7 * n_vertices * share if row_seconds is None else row_seconds
     colliding = colliding_share * rows
     again = (colliding + min(colliding, _FOLDED)) * row
@@ -119,7 +119,7 @@ def estimated_seconds(
         Stage.POSES: 5.0 + 1e-5 * n_vertices * n_poses * share,
         Stage.LATENT_SPACE: 3.0 + _latent_space(effort, share) * n_vertices * n_poses,
         Stage.LABELS: effort.n_samples * MIXED_COST * row,
-        Stage.PREDICTOR: 10.0 + again + 7e-4 * shown * share + judged,
+        Stage.PREDICTOR: 10.0 + again + 7e-4 * n_passes * share + judged,
     }
 
 

@@ -52,21 +52,29 @@ def write_members(
             target.mkdir(exist_ok=True)
             stored, notes = np.array(mesh, dtype=np.float64), dict[str, None]()
             for member, file in written_members(body, request.mesh_format):
-                path, own = target / file, member.body
+                path, member_body = target / file, member.body
                 back, rows = member.place.inverse(), body.vertices_of[member.name]
-                source = source_for(path.suffix, own)
-                asked = request
-                if source is not None and own.latent_size <= 6:
-                    asked = replace(request, form="obj" if path.suffix == ".obj" else "mesh")
+                source = source_for(path.suffix, member_body)
+                member_request = request
+                if source is not None and member_body.latent_size <= 6:
+                    member_request = replace(
+                        request, form="obj" if path.suffix == ".obj" else "mesh"
+                    )
                 codes = (
                     body.codes_of_member(member.name, pose.latent)
                     if member.moves
-                    else np.zeros(own.latent_size)
+                    else np.zeros(member_body.latent_size)
                 )
                 done = write_pose(
-                    path, own, codes, back.apply(mesh[rows]), None, asked, source=source
+                    path,
+                    member_body,
+                    codes,
+                    back.apply(mesh[rows]),
+                    None,
+                    member_request,
+                    source=source,
                 )
-                frame = export_frame(own, asked.axes, path, asked.scale)
+                frame = export_frame(member_body, member_request.axes, path, member_request.scale)
                 if source is not None and source.frame is not None:
                     frame = source.frame
                 assert done.vertices is not None
@@ -102,8 +110,8 @@ def written_members(
         if (member.moves or member.body.own_file is not None) and not member.is_fixed
     ]
     for member, stem in zip(members, file_stems(member.name for member in members), strict=True):
-        own = member.body.own_file
-        suffix = ".obj" if own is None else own.suffix.lower()
+        own_file = member.body.own_file
+        suffix = ".obj" if own_file is None else own_file.suffix.lower()
         if suffix in SCENE_SUFFIXES and suffix != ".vrm":
             suffix = ".glb"
         suffix = f".{mesh_format}" if mesh_format else suffix

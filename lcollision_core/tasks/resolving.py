@@ -130,7 +130,7 @@ def resolve_poses(request: ResolvePosesRequest, job: Job) -> list[ResolvedPose]:
     source = require_request(request.output, body, poses, request.export)
     inputs = _inputs_of_poses(body, poses, options)
     with run_of_poses(request.output.path, body, inputs, len(given), job) as run:
-        known = _known_results(body, run)
+        known_results = _known_results(body, run)
 
         def keep(index: int, result: ResolveResult) -> None:
             run.keep(str(index), (replace(poses[index], latent=result.latent), _facts(result)))
@@ -141,7 +141,7 @@ def resolve_poses(request: ResolvePosesRequest, job: Job) -> list[ResolvedPose]:
             request.workers,
             job,
             placements=[pose.placement for pose in poses],
-            done=known,
+            done=known_results,
             keep=keep,
         )
         detailed: list[npt.NDArray[np.float64] | None] = [None] * len(given)
@@ -437,7 +437,7 @@ def resolve_one(
     substeps, workers = request.choice.substeps, request.workers
     check = body.exact_check(clearance=options.frame.clearance)
     stop = None if options.budget is None else _Budget(options.budget, job)
-    known = {
+    known_frames = {
         int(at) - first: (pose.latent, bool(facts["free"]))
         for at, (pose, facts) in run.done.items()
         if first <= int(at) < first + len(motion)
@@ -459,7 +459,7 @@ def resolve_one(
         options,
         workers,
         job if stop is None else stop.watched,
-        done=known,
+        done=known_frames,
         keep=keep,
         stop=stop,
     )
@@ -467,8 +467,8 @@ def resolve_one(
     before = screen_motion(motion, check, substeps, workers, quiet)
     after = screen_motion(resolution.motion, check, substeps, workers, quiet, counted_only=False)
     report = MotionReport.of(motion, resolution.motion, check, resolution.standing)
-    kept = [span.to_json(body.domain_names) for span in resolution.kept]
-    row = _row(request, motion, before, after, report, kept, start)
+    kept_spans = [span.to_json(body.domain_names) for span in resolution.kept]
+    row = _row(request, motion, before, after, report, kept_spans, start)
     row.output, row.collides_between = str(request.output.path), resolution.touching
     contacts = contact_report(resolution.motion, check)
     row.contacts = None if contacts is None else contacts.to_json()
@@ -573,14 +573,14 @@ def _inputs_of_motions(
     values = {**values, "files": [_stamp(path) for path in files]}
     for number, motion in enumerate(motions):
         arrays |= {f"codes {number}": motion.codes, f"times {number}": motion.times}
-    chosen = {
+    settings = {
         "easing": options.easing,
         "substeps": options.substeps,
         "continuous": options.continuous,
     }
     feet = {"keep_feet": options.keep_feet, "feet": sorted(options.feet)}
     feet["keep_contacts"] = options.keep_contacts
-    return arrays, {**values, **chosen, **feet, "command": "resolve --motion"}
+    return arrays, {**values, **settings, **feet, "command": "resolve --motion"}
 
 
 def _as_frames(output: Output, files: Sequence[Path]) -> Output:
@@ -711,8 +711,8 @@ def _count_stuck(
     of_form += [(run, False) for run in runs(collides & ~named)]
     for span, is_original in of_form:
         ends = span.start, span.stop - 1
-        kept = KeptSpan(ends, Reason.AS_WRITTEN, is_original=is_original)
-        row.kept_spans.append(kept.to_json(body.domain_names))
+        kept_span = KeptSpan(ends, Reason.AS_WRITTEN, is_original=is_original)
+        row.kept_spans.append(kept_span.to_json(body.domain_names))
 
 
 def _write_clips(
@@ -781,8 +781,8 @@ def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
     key = _key_of_folder(request)
     with run_of_rows(folder / PARTIAL, key, len(files), is_current, job) as run:
         left = [(path, outputs[path]) for name, path in paths.items() if name not in run.done]
-        known = [_row_of(values) for item in run.done.values() for values in item["rows"]]
-        job.report(FolderStatus(len(run.done), len(files), known))
+        known_rows = [_row_of(values) for item in run.done.values() for values in item["rows"]]
+        job.report(FolderStatus(len(run.done), len(files), known_rows))
         start, n_bytes = time.perf_counter(), sum(stamps[path][0] for path, _ in left)
         n_bytes_done = 0
         work = _resolved_here if request.remote is None else _resolved_there
@@ -798,11 +798,11 @@ def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
                 spent = time.perf_counter() - start
                 seconds_left = spent * (n_bytes - n_bytes_done) / max(n_bytes_done, 1)
                 job.report(FolderStatus(len(run.done), len(files), rows, seconds_left))
-        kept = [values for name in paths for values in run.done[name]["rows"]]
+        row_values = [values for name in paths for values in run.done[name]["rows"]]
         with atomic_write(folder / _TABLE) as file:
-            file.write(_table_of(kept).encode())
+            file.write(_table_of(row_values).encode())
     job.note(say("wrote {file}", file=folder / _TABLE))
-    return [_row_of(values) for values in kept]
+    return [_row_of(values) for values in row_values]
 
 
 def _row_of(values: dict[str, Any]) -> Row:
@@ -810,9 +810,9 @@ def _row_of(values: dict[str, Any]) -> Row:
     if "error" in values:
         return FailedFile(values["source"], values["error"])
     names = {field.name for field in fields(ResolvedClip)}
-    own = {name: value for name, value in values.items() if name in names}
+    row_values = {name: value for name, value in values.items() if name in names}
     others = {name: value for name, value in values.items() if name not in names}
-    return ResolvedClip(**own, left_out=others)
+    return ResolvedClip(**row_values, left_out=others)
 
 
 def _resolved_here(request: ResolveMotionsRequest, files: _Files, job: Job) -> _Results:
@@ -938,8 +938,8 @@ def motion_outputs(
     for path in files:
         suffix = path.suffix.lower()
         if suffix in SCENE_SUFFIXES and body.joints is not None:
-            own = "" if body.own_file is None else body.own_file.suffix.lower()
-            suffix = suffix if suffix == own == ".vrm" else ".glb"
+            own_suffix = "" if body.own_file is None else body.own_file.suffix.lower()
+            suffix = suffix if suffix == own_suffix == ".vrm" else ".glb"
         elif suffix not in (".json", ".mdd") and not (
             suffix in OWN_SUFFIXES
             and is_of_skeleton(path)
@@ -968,10 +968,10 @@ _CHOSEN = ("easing", "keep_feet", "keep_contacts", "budget")
 def _key_of_folder(request: ResolveMotionsRequest) -> str:
     options = request.options
     arrays, values = depends_on(request.body, options.frame)
-    chosen = {name: getattr(options, name) for name in _CHOSEN}
-    chosen |= {"feet": sorted(options.feet), "only_check": request.only_check}
-    chosen |= {"resolved": [options.substeps, options.continuous]}
-    return key_of(request.body, arrays, {**values, **chosen, **asdict(request.choice)})
+    settings = {name: getattr(options, name) for name in _CHOSEN}
+    settings |= {"feet": sorted(options.feet), "only_check": request.only_check}
+    settings |= {"resolved": [options.substeps, options.continuous]}
+    return key_of(request.body, arrays, {**values, **settings, **asdict(request.choice)})
 
 
 def _stamp(path: Path) -> list[int]:
@@ -993,8 +993,8 @@ def _table_of(rows: Iterable[dict[str, Any]]) -> str:
     writer = csv.DictWriter(table, _COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for row in rows:
-        kept = "; ".join(span["sentence"] for span in row.get("kept_spans", ()))
+        kept_text = "; ".join(span["sentence"] for span in row.get("kept_spans", ()))
         contacts = row.get("contacts") or {}
         counts = {f"contacts_{name}": len(contacts.get(name, ())) for name in ("kept", "lost")}
-        writer.writerow({**row, "kept": kept, **counts})
+        writer.writerow({**row, "kept": kept_text, **counts})
     return table.getvalue()

@@ -84,8 +84,8 @@ def scene_of(source: str, options: SceneOptions) -> SceneFile:
     def numbered(name: str, option: str) -> int:
         if name in names:
             return names.index(name)
-        known = f"its bodies are {', '.join(names)}"
-        raise LCollisionError(f"{option} names {name!r}, which is not in the scene", known)
+        bodies_text = f"its bodies are {', '.join(names)}"
+        raise LCollisionError(f"{option} names {name!r}, which is not in the scene", bodies_text)
 
     for name in options.fixed:
         number = numbered(name, "--fixed")
@@ -164,12 +164,14 @@ def with_ground(body: Body, body_file: str) -> str:
     from lcollision_core.bodies.scene_body import SceneFile, ScenePart
 
     scene = as_scene(body)
-    held = None if scene is None else scene.file
-    if held is None:
-        held = SceneFile((ScenePart(str(Path(body_file).absolute())),))
-    elif held.ground is not None and len(held.bodies) == 1:
-        return held.bodies[0].file
-    return str(kept_scene(replace(held, ground="rest" if held.ground is None else None)))
+    scene_file = None if scene is None else scene.file
+    if scene_file is None:
+        scene_file = SceneFile((ScenePart(str(Path(body_file).absolute())),))
+    elif scene_file.ground is not None and len(scene_file.bodies) == 1:
+        return scene_file.bodies[0].file
+    return str(
+        kept_scene(replace(scene_file, ground="rest" if scene_file.ground is None else None))
+    )
 
 
 def kept_scene(scene: SceneFile) -> Path:
@@ -322,14 +324,14 @@ def scene_motion(
     from lcollision_core.bodies.motions import read_motions
     from lcollision_core.motion import Motion
 
-    asked = _asked_clips(body, played, choice.clip)
-    if not asked:
+    asked_clips = _asked_clips(body, played, choice.clip)
+    if not asked_clips:
         raise LCollisionError(
             "has no clip", "say what moves with --play NAME=FILE", where=body.name
         )
     rates = [
         read_motions(body.member(name).body, file, clip, None, job.part())[0].rate
-        for name, (file, clip, _) in asked.items()
+        for name, (file, clip, _) in asked_clips.items()
         if choice.fps is None
     ]
     rate = choice.fps or max(rates, default=_ONLY_CLIP_RATE)
@@ -337,10 +339,10 @@ def scene_motion(
     for member in body.members:
         if not member.moves:
             continue
-        if member.name not in asked:
+        if member.name not in asked_clips:
             motions.append(PlayedMotion(member, None, None, 0))
             continue
-        file, clip, seconds = asked[member.name]
+        file, clip, seconds = asked_clips[member.name]
         motion = read_motions(member.body, file, clip, rate, job.part())[0].at_rate(rate)
         motions.append(PlayedMotion(member, motion, file, round(seconds * rate)))
     n = max(played.start + len(played.motion) for played in motions if played.motion is not None)
@@ -362,9 +364,11 @@ def scene_motion(
         for one in shaped:
             assert one.motion is not None
             last = len(one.motion) - 1
-            own = one.motion.space(float(np.clip(time - one.start, 0, last)), one.member.body.space)
+            frame_space = one.motion.space(
+                float(np.clip(time - one.start, 0, last)), one.member.body.space
+            )
             at = [member.name for member in body.standing].index(one.member.name)
-            spaces[at] = own
+            spaces[at] = frame_space
         return space.with_spaces(spaces)
 
     holders = {member.holder for member in body.members}
@@ -402,12 +406,12 @@ def _asked_clips(
     body: SceneBody, played: Sequence[str], clip: str | None
 ) -> dict[str, tuple[Path, str | None, float]]:
     """Return the file, clip and start time in seconds of each body that moves."""
-    asked: dict[str, tuple[Path, str | None, float]] = {}
-    for name, (own, start) in body.plays.items():
+    clip_of_body: dict[str, tuple[Path, str | None, float]] = {}
+    for name, (first_clip, start) in body.plays.items():
         member = body.member(name)
         assert member.body.own_file is not None
-        chosen = clip if clip in member.body.own_clips else own
-        asked[name] = member.body.own_file, chosen, start
+        clip_name = clip if clip in member.body.own_clips else first_clip
+        clip_of_body[name] = member.body.own_file, clip_name, start
     for entry in played:
         name, equals, what = entry.partition("=")
         member = body.member(name)
@@ -419,17 +423,17 @@ def _asked_clips(
         if not equals or not 0.0 <= start < 1e6 or not member.moves:
             raise LCollisionError("is not NAME=CLIP or NAME=CLIP@SECONDS", where=f"--play {entry}")
         if what in member.body.own_clips and member.body.own_file is not None:
-            asked[name] = member.body.own_file, what, start
+            clip_of_body[name] = member.body.own_file, what, start
         elif Path(what).is_file():
-            asked[name] = Path(what), None, start
+            clip_of_body[name] = Path(what), None, start
         else:
-            known = ", ".join(member.body.own_clips) or "none"
+            clip_names = ", ".join(member.body.own_clips) or "none"
             raise LCollisionError(
                 f"is neither a clip of {name} nor a file",
-                f"its clips are {known}",
+                f"its clips are {clip_names}",
                 where=repr(what),
             )
-    return asked
+    return clip_of_body
 
 
 def write_member_motions(
@@ -481,9 +485,9 @@ def write_member_motions(
                 name = before.name if motion is None else motion.name
                 write_new_clips(path, member.body, [Motion(name, after.times, new)])
             else:
-                shown = slice(one.start, one.start + len(motion))
-                changed = replace(motion, codes=np.array(new[shown]))
-                spans = runs((old[shown] != new[shown]).any(axis=1))
+                frame_rows = slice(one.start, one.start + len(motion))
+                changed = replace(motion, codes=np.array(new[frame_rows]))
+                spans = runs((old[frame_rows] != new[frame_rows]).any(axis=1))
                 change = MotionChange(motion, changed, spans)
                 written = write_clips(path, member.body, own_file, [change])
                 for sentence in written.notes:

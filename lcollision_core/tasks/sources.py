@@ -114,8 +114,8 @@ def gather_poses(
             return {"clip": clip, "fps": fps}
         if file.suffix.lower() not in SCENE_SUFFIXES:
             return {}
-        own = characters.get(file)
-        return {"clip": clip if own is None or clip in own.clips else None, "fps": fps}
+        character = characters.get(file)
+        return {"clip": clip if character is None or clip in character.clips else None, "fps": fps}
 
     pose_sets: list[PoseSet] = []
     for number, file in enumerate(files):
@@ -140,8 +140,8 @@ def gather_poses(
         if len(pose_sets) > 1:
             # The pose names include their files' names.
             poses = replace(poses, source=None)
-        made = poses_by_rig(body, by_rig, seed, part(len(files)))
-        poses = replace(concatenated([poses, made]), source=files[0])
+        drawn_poses = poses_by_rig(body, by_rig, seed, part(len(files)))
+        poses = replace(concatenated([poses, drawn_poses]), source=files[0])
     if body is not None:
         # Use the rules of the posed character, so that verdicts agree.
         notes = tuple(dict.fromkeys((*poses.notes, *body.notes)))
@@ -184,14 +184,14 @@ def with_proposed_rules(
     if request.ignored == ():
         rules = replace(rules, ignored=())
     ruled = replace(poses, rules=rules, groups=groups)
-    chosen = evenly_spaced(len(poses), _MOST_POSES)
+    pose_numbers = evenly_spaced(len(poses), _MOST_POSES)
     if request.near_exclusion is None and not rules.near_exclusion:
-        rules = replace(rules, near_exclusion=_near_exclusion(ruled, chosen, job.part()))
+        rules = replace(rules, near_exclusion=_near_exclusion(ruled, pose_numbers, job.part()))
         ruled = replace(ruled, rules=rules)
     if request.ignored == ():
         return ruled
-    asked = poses.vertices[chosen]
-    touching = touching_patches(_detector(ruled), asked, TOUCHING_RADIUS, job)
+    sampled_poses = poses.vertices[pose_numbers]
+    touching = touching_patches(_detector(ruled), sampled_poses, TOUCHING_RADIUS, job)
     if not touching:
         return ruled
     return replace(ruled, rules=replace(rules, touching=touching, touching_radius=TOUCHING_RADIUS))

@@ -478,7 +478,7 @@ def contacts_text(contacts: dict[str, Any] | None) -> str | None:
     if contacts is None or not contacts["frames"]:
         return None
     lost = [" and ".join(names) for names in contacts["lost"]]
-    said = say(
+    contact_text = say(
         "{kept} of {all} contacts kept, in {together} of {frames} frames of them",
         kept=len(contacts["kept"]),
         all=len(contacts["kept"]) + len(lost),
@@ -486,7 +486,11 @@ def contacts_text(contacts: dict[str, Any] | None) -> str | None:
         frames=contacts["frames"],
     )
     named = list(dict.fromkeys(lost))[:_NAMED_CONTACTS]
-    return say("{said} (lost: {named})", said=said, named="; ".join(named)) if named else said
+    return (
+        say("{said} (lost: {named})", said=contact_text, named="; ".join(named))
+        if named
+        else contact_text
+    )
 
 
 _NAMED_CONTACTS = 4

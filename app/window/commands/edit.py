@@ -128,9 +128,9 @@ def _parts(window: EditorWindow) -> None:
 def _show_contacts(window: EditorWindow) -> None:
     """Show the contact rules beside the body, with excluded pairs tinted."""
     viewport = window.viewport
-    for shown in window.findChildren(ContactsDialog):
-        if shown.isVisible():
-            shown.activateWindow()
+    for open_dialog in window.findChildren(ContactsDialog):
+        if open_dialog.isVisible():
+            open_dialog.activateWindow()
             return
     dialog = ContactsDialog(window.document, window)
     dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)

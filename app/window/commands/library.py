@@ -85,8 +85,8 @@ def _why_not_one(window: EditorWindow) -> str:
 
 def _why_not_own(window: EditorWindow) -> str:
     panel = window.library
-    own = panel.chosen_poses and panel.source is Source.LIBRARY
-    return "" if own else "Select poses of your library first"
+    is_own_pose = panel.chosen_poses and panel.source is Source.LIBRARY
+    return "" if is_own_pose else "Select poses of your library first"
 
 
 def _why_not_updated(window: EditorWindow) -> str:
@@ -99,14 +99,14 @@ def _why_not_updated(window: EditorWindow) -> str:
 
 
 def _update_text(window: EditorWindow) -> str:
-    kept = window.document.history.library_pose
-    return "&Update pose" if kept is None else f"&Update “{menu_text(kept.name)}”"
+    library_pose = window.document.history.library_pose
+    return "&Update pose" if library_pose is None else f"&Update “{menu_text(library_pose.name)}”"
 
 
 def _add_text(window: EditorWindow) -> str:
     addable = _addable(window)
-    chosen = window.library.chosen_poses or not addable
-    return f"Add &{'selected' if chosen else f'all {len(addable)}'} to library"
+    poses = window.library.chosen_poses or not addable
+    return f"Add &{'selected' if poses else f'all {len(addable)}'} to library"
 
 
 @LIBRARY.command("load", "&Load selected pose", "Ctrl+Return", "Edit the selected pose")
@@ -129,10 +129,10 @@ LIBRARY.line()
 @LIBRARY.command("rename", "Re&name…", "F2", "Rename the selected pose of your library")
 @greyed(lambda window: _why_not_own(window) or _why_not_one(window))
 def _rename(window: EditorWindow) -> None:
-    chosen, document = window.library.chosen_own, window.document
-    if chosen is None:
+    pose, document = window.library.chosen_own, window.document
+    if pose is None:
         return
-    old = chosen.name
+    old = pose.name
     label = f"New name of “{old}”:"
     why_not = partial(document.library.why_not_called, old=old)
     name = ask_for_name(window, "Rename a pose", label, old, why_not)
@@ -144,17 +144,17 @@ def _rename(window: EditorWindow) -> None:
 @LIBRARY.command("tags", "Ta&gs…", "Ctrl+Shift+T", "Edit the tags of the selected poses")
 @greyed(_why_not_own)
 def _tag(window: EditorWindow) -> None:
-    chosen = window.library.chosen_poses
-    shared = [tag for tag in chosen[0].tags if all(tag in pose.tags for pose in chosen)]
-    which = "Tags of" if len(chosen) == 1 else "Tags that are shared by"
-    label = f"{which} {_called(chosen)}, with commas between them:"
+    poses = window.library.chosen_poses
+    shared = [tag for tag in poses[0].tags if all(tag in pose.tags for pose in poses)]
+    which = "Tags of" if len(poses) == 1 else "Tags that are shared by"
+    label = f"{which} {_called(poses)}, with commas between them:"
 
     def refuse(text: str) -> str:
-        return _why_no_tags(max((retagged(p, _split(text), shared) for p in chosen), key=len))
+        return _why_no_tags(max((retagged(p, _split(text), shared) for p in poses), key=len))
 
     text = ask_for_name(window, "Tags", label, ", ".join(shared), refuse)
     if text is not None:
-        window.document.library.tag_poses([pose.name for pose in chosen], _split(text), shared)
+        window.document.library.tag_poses([pose.name for pose in poses], _split(text), shared)
 
 
 @LIBRARY.command(

@@ -318,9 +318,9 @@ class ContactsDialog(QDialog):
                 box.insertSeparator(box.count())
             box.addItems(list(materials))
         self.second.setCurrentIndex(min(1, len(others) - 1))
-        kept = self._where_kept()
-        self._write(self.kept, kept)
-        self.kept.setVisible(bool(kept))
+        store_text = self._where_kept()
+        self._write(self.kept, store_text)
+        self.kept.setVisible(bool(store_text))
         self.restore.setVisible(not model.is_trained)
         for label in self.counts.values():
             label.setText("…")
@@ -334,10 +334,10 @@ class ContactsDialog(QDialog):
         for name, label in self.counts.items():
             label.setText(f"{counted(getattr(found.excluded, name), 'pair')} at rest")
         left = counted(found.n_counted, "pair")
-        said = f"At rest {counted(found.excluded.total, 'pair')} not counted, {left} counted."
+        count_text = f"At rest {counted(found.excluded.total, 'pair')} not counted, {left} counted."
         if found.n_counted:
-            said += " While pairs collide at rest, no pose is free: widen a rule."
-        self._write(self.total, said)
+            count_text += " While pairs collide at rest, no pose is free: widen a rule."
+        self._write(self.total, count_text)
 
     @Slot()
     def _on_edited(self) -> None:
@@ -479,18 +479,18 @@ class ContactsDialog(QDialog):
         from lcollision_core.meshes.face_groups import GROUP_KINDS
 
         model = self._document.model
-        own, parts = (model.groups_by_kind[kind] for kind in GROUP_KINDS[:2])
+        file_groups, parts = (model.groups_by_kind[kind] for kind in GROUP_KINDS[:2])
         named = {
             # A learned model does not tell meshes from materials.
             "meshes and materials" if model.is_trained else "meshes": [
-                group.name for group in own if not group.is_material
+                group.name for group in file_groups if not group.is_material
             ],
-            "materials": [group.name for group in own if group.is_material],
+            "materials": [group.name for group in file_groups if group.is_material],
             "body parts": [group.name for group in parts],
         }
-        known = {name for names in named.values() for name in names}
-        named["others"] = [name for name in rules.left_out if name not in known]
-        if len({*known, *named["others"]}) < _FEWEST_PARTS:
+        known_names = {name for names in named.values() for name in names}
+        named["others"] = [name for name in rules.left_out if name not in known_names]
+        if len({*known_names, *named["others"]}) < _FEWEST_PARTS:
             return
         for kind, names in named.items():
             self._list_kind(f"Leave out {kind}", names, rules)
@@ -536,5 +536,5 @@ class ContactsDialog(QDialog):
 
 def _length(field: NumberBox, held: float | None) -> float:
     """Return a field's normalised length, or `held` unrounded while the field still shows it."""
-    shown = None if held is None else round(_PERCENT * held, field.decimals())
-    return field.value() / _PERCENT if held is None or field.value() != shown else held
+    percentage = None if held is None else round(_PERCENT * held, field.decimals())
+    return field.value() / _PERCENT if held is None or field.value() != percentage else held

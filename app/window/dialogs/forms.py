@@ -56,9 +56,9 @@ class ColourButton(QPushButton):
 
     @Slot()
     def _ask(self) -> None:
-        chosen = QColorDialog.getColor(QColor(self.text()), self, self._title)
-        if chosen.isValid():
-            self._show(chosen)
+        colour = QColorDialog.getColor(QColor(self.text()), self, self._title)
+        if colour.isValid():
+            self._show(colour)
 
     def _show(self, colour: QColor) -> None:
         self.setIcon(swatch(colour.name(), self.iconSize().height(), self.devicePixelRatioF()))
@@ -402,9 +402,9 @@ class ExportDialog(_FrameForm):
             return {form.suffix.removeprefix(".").upper(): form.suffix}
         # Without a form, leave out formats that the body's own file already offers as forms.
         is_own = self._character is not None
-        own = () if self._own is None else offered_forms(self._own, has_rig=is_own)
-        taken = {offered.suffix for offered in own}
-        return {kind: suffix for kind, suffix in _MESHES.items() if suffix not in taken}
+        own_forms = () if self._own is None else offered_forms(self._own, has_rig=is_own)
+        own_suffixes = {offered.suffix for offered in own_forms}
+        return {kind: suffix for kind, suffix in _MESHES.items() if suffix not in own_suffixes}
 
     @property
     def export_request(self) -> ExportRequest:
@@ -442,12 +442,12 @@ class ExportDialog(_FrameForm):
             )
         offered = offered_forms(source, has_rig=has_rig) if source is not None else ()
         self._forms = {form.key: form for form in offered if not form.is_sequence}
-        wanted = self._settings["export_form"]
+        remembered = self._settings["export_form"]
         self.form.clear()
         for key, form in self._forms.items():
             self.form.addItem(form.label, key)
         self.form.addItem("Mesh", MESH)
-        self.form.setCurrentIndex(max(0, self.form.findData(wanted)))
+        self.form.setCurrentIndex(max(0, self.form.findData(remembered)))
         self.form.setEnabled(bool(self._forms))
         self._explain()
 
@@ -557,8 +557,8 @@ class MotionDialog(_FrameForm):
     @property
     def frames(self) -> range:
         """The frames of a timeline's motion to write."""
-        chosen: range = self.range.currentData()
-        return chosen
+        frames: range = self.range.currentData()
+        return frames
 
     @property
     def export_request(self) -> ExportRequest:
@@ -621,9 +621,9 @@ def _meanings(model: Body) -> dict[str, str]:
 
     looks = int(abs(model.front).argmax())
     sign = "-" if model.front[looks] < 0.0 else "+"
-    own = f"{'xyz'[model.up_axis]} is up, front is {sign}{'xyz'[looks]}"
+    model_axes = f"{'xyz'[model.up_axis]} is up, front is {sign}{'xyz'[looks]}"
     return {
-        ExportAxes.MODEL: f"Same as the model: {own}.",
+        ExportAxes.MODEL: f"Same as the model: {model_axes}.",
         ExportAxes.Y_UP: "y is up, front is +z, in the model's unit.",
         ExportAxes.BLENDER: "Upright and facing you in Blender's front view, with its "
         "importers' default settings, in metres.",

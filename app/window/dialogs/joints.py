@@ -120,9 +120,9 @@ class JointsDialog(QDialog):
 
     @Slot()
     def _accept(self) -> None:
-        chosen = {joint: choice.currentData() for joint, choice in self.choices.items()}
+        partner_of_joint = {joint: choice.currentData() for joint, choice in self.choices.items()}
         self.accept()
-        self.chosen.emit({**self._match.followed, **chosen})
+        self.chosen.emit({**self._match.followed, **partner_of_joint})
 
 
 class _Choice(QComboBox):

@@ -218,7 +218,7 @@ class LearningDialog(QDialog):
         self._stages.follow(run)
         collides = has_ended and run.status.mostly_collides
         can_open = is_done or (collides and bool(run.status.model))
-        for widget, wanted in (
+        for widget, visible in (
             *(
                 (self.bar, not is_done),
                 (self._stages, not is_done),
@@ -231,7 +231,7 @@ class LearningDialog(QDialog):
                 (self._note, run.is_active and state != RunState.WAITING),
             ),
         ):
-            widget.setVisible(wanted)
+            widget.setVisible(visible)
         self.discard.setEnabled(state != RunState.STOPPING)
         if is_done and run.path not in (self._card_of, self._read_for):
             self._work.cancel(self._reading)

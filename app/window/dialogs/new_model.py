@@ -166,15 +166,15 @@ class FilesPage(Page):
 
     def add(self, paths: Sequence[Path]) -> None:
         """List more files, each once."""
-        known = set(self.paths)
+        listed_paths = set(self.paths)
         for path in dict.fromkeys(path.absolute() for path in paths):
-            if path not in known:
+            if path not in listed_paths:
                 kind = " (folder)" if path.is_dir() else ""
                 item = QListWidgetItem(f"{path.name}{kind}")
                 item.setData(_PATH, str(path))
                 item.setToolTip(plain_tip(str(path)))
                 self.list.addItem(item)
-        if set(self.paths) != known:
+        if set(self.paths) != listed_paths:
             self.paths_changed.emit()
 
     def tell(self, text: str, is_problem: bool = False) -> None:
@@ -286,10 +286,10 @@ class PosesPage(Page):
                 self.clip.addItem(f"{clip.name} ({counted(clip.n_frames, 'frame')})", clip.name)
         self._clips.setVisible(bool(summary.clips))
         self._rig.setVisible(bool(summary.n_joints))
-        said = "As in the file" if summary.up.is_sure else "Guessed"
-        own = summary.up.axis
+        axis_source = "As in the file" if summary.up.is_sure else "Guessed"
+        file_axis = summary.up.axis
         self.up.clear()
-        self.up.addItem(f"{said}: {_AXES[own]}", None)
+        self.up.addItem(f"{axis_source}: {_AXES[file_axis]}", None)
         for axis in range(3):
             self.up.addItem(f"{_AXES[axis]} is up", axis)
         self._on_edited()
@@ -298,8 +298,8 @@ class PosesPage(Page):
     def up_axis(self) -> int:
         """The chosen up axis."""
         assert self._summary is not None
-        chosen = self.up.currentData()
-        return self._summary.up.axis if chosen is None else int(chosen)
+        chosen_axis = self.up.currentData()
+        return self._summary.up.axis if chosen_axis is None else int(chosen_axis)
 
     def values(self) -> dict[str, Any]:
         """Return clip, rate, poses by the rig, axis and scale."""

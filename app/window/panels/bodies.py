@@ -178,9 +178,9 @@ class BodiesPanel(QWidget):
         scene, row = self.scene, self.tree.currentItem()
         if scene is None or row is None:
             return
-        name, wanted = row.text(_NAME), (self.clip.currentText(), self.start.value())
-        if scene.plays.get(name, wanted) != wanted:
-            self.clip_wanted.emit(name, *wanted)
+        name, choice = row.text(_NAME), (self.clip.currentText(), self.start.value())
+        if scene.plays.get(name, choice) != choice:
+            self.clip_wanted.emit(name, *choice)
 
     def _rows(self) -> list[QTreeWidgetItem]:
         rows = map(self.tree.topLevelItem, range(self.tree.topLevelItemCount()))

@@ -415,8 +415,8 @@ class ExactCard(Card):
     @Slot()
     def _on_frame(self) -> None:
         motion = self._document.motion
-        shown = motion.frame, motion.exact
-        if any(new is not old for new, old in zip(shown, self._shown, strict=True)):
+        frame_shown = motion.frame, motion.exact
+        if any(new is not old for new, old in zip(frame_shown, self._shown, strict=True)):
             self._show()
 
     def _show(self) -> None:
@@ -482,34 +482,34 @@ class ExactCard(Card):
         left_out = verdict.counted_only or excluded.total > 0
         is_held = frame is not None and len(frame.contacts) > 0
         headline = "Colliding (checked)" if verdict.colliding else "No collisions (checked)"
-        said, tips = [], []
+        sentences, tips = [], []
         if verdict.colliding:
             pairs = counted(len(verdict.pairs), "pair")
-            said.append(f"{pairs} of triangles, overlap {overlap_text(verdict.energy)}")
+            sentences.append(f"{pairs} of triangles, overlap {overlap_text(verdict.energy)}")
             tips.append(
                 "Overlap: how deep all crossing triangles penetrate each other, combined, in per "
                 "cent of the body size"
             )
         elif is_held:
-            said.append(_HELD)
+            sentences.append(_HELD)
         else:
-            said.append(f"No {'other ' if left_out else ''}triangles cross")
+            sentences.append(f"No {'other ' if left_out else ''}triangles cross")
         rules = document.model.rules
         if rules.left_out:
-            said.append(with_capital(rules.left_out_in_words()))
+            sentences.append(with_capital(rules.left_out_in_words()))
         if left_out:
             if verdict.counted_only:
                 what, sentence = rules.in_short(), f"{rules.described()} are not counted"
             else:
                 what, sentence = excluded.described(), rules.sentence(excluded)
-            said.append(f"Pairs not counted: {what}")
+            sentences.append(f"Pairs not counted: {what}")
             tips.insert(0, f"{headline}; {sentence}: see Edit > Contacts")
         if is_held and verdict.colliding:
             # Explain why the drag goes no further.
-            said.append(_NO_DEEPER)
+            sentences.append(_NO_DEEPER)
         self.verdict.setText(headline)
         # Keep the unit on the line of its number.
-        self.details.setText("\n".join(said).replace(" %", "\N{NO-BREAK SPACE}%"))
+        self.details.setText("\n".join(sentences).replace(" %", "\N{NO-BREAK SPACE}%"))
         for label in (self.verdict, self.details):
             label.setToolTip(plain_tip("\n".join(tips)) if tips else "")
 

@@ -341,7 +341,7 @@ class LibraryPanel(QWidget):
         document = self._document
         if not document.has_model:
             return
-        current, chosen = self.chosen, {pose.name for pose in self.chosen_poses}
+        current, chosen_names = self.chosen, {pose.name for pose in self.chosen_poses}
         if self.source is Source.TRAINING:
             # A character's other poses, the frames of its clips, are on the timeline.
             is_trained = document.model.is_trained
@@ -350,8 +350,10 @@ class LibraryPanel(QWidget):
         elif self.source is Source.STARTER:
             self._poses = starter_poses(document.model)
         else:
-            own = self.source is Source.LIBRARY
-            self._poses = list(document.library.poses if own else document.history.file_poses)
+            is_library = self.source is Source.LIBRARY
+            self._poses = list(
+                document.library.poses if is_library else document.history.file_poses
+            )
         with silent(self.list):
             self.list.clear()
             for pose in self._poses:
@@ -363,7 +365,7 @@ class LibraryPanel(QWidget):
             if current is not None and current.name in self._names():
                 self.list.setCurrentRow(self._names().index(current.name), _ONLY)
             for row, pose in enumerate(self._poses):
-                self.list.item(row).setSelected(pose.name in chosen)
+                self.list.item(row).setSelected(pose.name in chosen_names)
         for button, text, poses in (
             (self.own, "Library", document.library.poses),
             (self.of_file, "This file", document.history.file_poses),
@@ -396,10 +398,10 @@ class LibraryPanel(QWidget):
         n_shown = 0
         for row, pose in enumerate(self._poses):
             text = " ".join((pose.name, *pose.tags)).casefold()
-            shown = all(word in text for word in words) and self._tag in (*pose.tags, "")
-            self.list.setRowHidden(row, not shown)
-            n_shown += shown
-            if not shown:
+            matches = all(word in text for word in words) and self._tag in (*pose.tags, "")
+            self.list.setRowHidden(row, not matches)
+            n_shown += matches
+            if not matches:
                 self.list.item(row).setSelected(False)
         hint = (
             "Poses that you add to your library appear here"
@@ -500,14 +502,14 @@ class LibraryPanel(QWidget):
     def _picture(self, pose: NamedPose) -> QIcon:
         model = self._document.model
         sharpness = self.devicePixelRatioF()
-        seen = vertices = model.decode(pose.latent, 1).astype(np.float32)
+        posed_vertices = vertices = model.decode(pose.latent, 1).astype(np.float32)
         faces = model.faces if self._hidden is None else model.faces[~self._hidden]
         if pose.moves is not None:
             # For a hand pose, show one hand, large enough to be seen.
             part = model.code_effects[int(np.flatnonzero(pose.moves)[0])].domain
             faces = faces[(model.attention_mask[part] > 0.5)[faces].all(axis=1)]
-            seen = vertices[np.unique(faces)]
-        view = preset_view("Three-quarter", seen, model.up_axis, model.front, 1.0)
+            posed_vertices = vertices[np.unique(faces)]
+        view = preset_view("Three-quarter", posed_vertices, model.up_axis, model.front, 1.0)
         drawn = picture_of(vertices, faces, view, THUMBNAIL, sharpness)
         picture = QIcon()
         for mode in (QIcon.Mode.Normal, QIcon.Mode.Selected):

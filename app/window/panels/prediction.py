@@ -286,8 +286,8 @@ class PredictionCard(Card):
         word = "colliding" if collides else "free"
         self.meter.show_probability(probability, is_aside=exact is not None)
         overruled = exact is not None and exact.colliding != collides
-        said = "Probably colliding" if collides else "Probably clear"
-        self.verdict.setText("Overruled by the check" if overruled else said)
+        verdict = "Probably colliding" if collides else "Probably clear"
+        self.verdict.setText("Overruled by the check" if overruled else verdict)
         self.percent.setText(f"{100 * probability:.0f} %")
         for label in (self.verdict, self.percent):
             show_verdict(label, word if exact is None else "aside")

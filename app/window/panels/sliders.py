@@ -234,13 +234,13 @@ class CodeRow(HoverRow):
         source = f"motion {index + 1}"
         if not model.is_trained:
             source = next(g for g in space.groups if code < g.codes.stop).code_names[index]
-        said = f"{name} ({source})" if source != name else name
+        named = f"{name} ({source})" if source != name else name
         full = name if is_shape else heading(code_name(document.model, code))
         self.slider.setAccessibleName(full)
         self.field.setAccessibleName(f"{full}, number")
         self.slider.setToolTip(
             plain_tip(
-                f"{said}: drag to move, hold Ctrl to move ten times finer, double-click to reset"
+                f"{named}: drag to move, hold Ctrl to move ten times finer, double-click to reset"
             )
         )
         line = hbox(label, self.slider, self.field, wide=self.slider, margins=(TIGHT, 0, TIGHT, 0))
@@ -572,9 +572,11 @@ class SlidersPanel(QWidget):
         groups = model.latent_space.groups
         self.groups = [SliderGroup(self, index, group) for index, group in enumerate(groups)]
         order = [0, *(1 + domain for domain in model.domain_order)]
-        shown = [self.groups[index] for index in (*order, *range(len(order), len(groups)))]
+        groups_in_order = [
+            self.groups[index] for index in (*order, *range(len(order), len(groups)))
+        ]
         before: QWidget = self.filter
-        for index, group in enumerate(shown):
+        for index, group in enumerate(groups_in_order):
             self._column.insertWidget(index, group)
             QWidget.setTabOrder(before, group.header.button)
             before = group.header.button

@@ -260,8 +260,8 @@ class TimelinePanel(QWidget):
         self.strip.set_depths(checks.deepest)
         self.strip.set_between(checks.between)
         name = "" if part is None else self._document.model.domain_names[part]
-        known = np.where(np.isnan(checks.deepest), np.nan, checks.parts[:, part or 0])
-        self.strip.set_curve(checks.deepest if part is None else known, name)
+        depths = np.where(np.isnan(checks.deepest), np.nan, checks.parts[:, part or 0])
+        self.strip.set_curve(checks.deepest if part is None else depths, name)
         self.strip.set_estimate(checks.estimate if self._document.model.has_predictor else None)
         self.strip.set_resolved(timeline.resolving.spans)
         if not timeline.playing:

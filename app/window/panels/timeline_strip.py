@@ -129,8 +129,8 @@ def round_up(value: float) -> float:
 
 def known_runs(values: FloatArray) -> Iterator[slice]:
     """Yield the runs of finite values."""
-    known = np.concatenate([[False], np.isfinite(values), [False]])
-    turns = np.flatnonzero(known[1:] != known[:-1])
+    is_known = np.concatenate([[False], np.isfinite(values), [False]])
+    turns = np.flatnonzero(is_known[1:] != is_known[:-1])
     for start, stop in turns.reshape(-1, 2):
         yield slice(start, stop)
 
@@ -304,8 +304,8 @@ class TimelineStrip(QWidget):
         elif self._frame is None:
             text = f"{counted(len(self._times), 'frame')}, none of them shown"
         else:
-            which, *known = self._facts(self._frame)
-            text = f"{which}: {', '.join(known)}"
+            which, *facts = self._facts(self._frame)
+            text = f"{which}: {', '.join(facts)}"
         self.setAccessibleDescription(text)
 
     def _facts(self, frame: int) -> list[str]:

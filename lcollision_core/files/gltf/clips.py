@@ -255,14 +255,14 @@ class _GltfClip:
         """The (T,) key times by accessor; equal times share an array."""
         what = f"the times of {self.where}"
         times_of: dict[int, FloatArray] = {}
-        known: dict[bytes, FloatArray] = {}
+        times_of_bytes: dict[bytes, FloatArray] = {}
         last = len(self.document.objects("accessors")) - 1
         for sampler, _ in self.driven.values():
             index = whole(sampler.get("input"), f"the accessor of {what}", 0, last)
             if index not in times_of:
                 times = as_float(self.document.array(index, what, ("SCALAR",))[:, 0])
-                times_of[index] = known.setdefault(times.tobytes(), times)
-        for times in known.values():
+                times_of[index] = times_of_bytes.setdefault(times.tobytes(), times)
+        for times in times_of_bytes.values():
             if not len(times):
                 raise MeshFileError(f"{self.where} has no keys")
             if not np.isfinite(times).all() or (np.diff(times) < 0.0).any():

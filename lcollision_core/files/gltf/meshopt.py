@@ -71,13 +71,13 @@ def _rows(packed: Bytes, count: int, stride: int) -> Bytes:
     rows = np.empty((count + 1, stride), dtype=np.uint8)
     rows[0] = base
     for channel in range(stride // 4):
-        own = slice(4 * channel, 4 * channel + 4)
+        channel_bytes = slice(4 * channel, 4 * channel + 4)
         form = int(channels[channel]) if version else 0
         if form & 3 == 3:
             raise _damaged()
         width = (np.uint8, np.uint16, np.uint32)[form & 3]
-        first = base[own].copy().view(width)
-        changes: npt.NDArray[Any] = np.ascontiguousarray(deltas[:, own]).view(width)
+        first = base[channel_bytes].copy().view(width)
+        changes: npt.NDArray[Any] = np.ascontiguousarray(deltas[:, channel_bytes]).view(width)
         if form & 3 == 2:
             turn = np.uint32(form >> 4)
             changes = changes >> turn | changes << (np.uint32(32) - turn) if turn else changes
@@ -85,7 +85,7 @@ def _rows(packed: Bytes, count: int, stride: int) -> Bytes:
         else:
             signed = changes >> width(1) ^ (~(changes & width(1)) + width(1))
             values = np.cumsum(np.concatenate([first[None], signed]), axis=0, dtype=width)
-        rows[:, own] = values.view(np.uint8)
+        rows[:, channel_bytes] = values.view(np.uint8)
     return rows[1:]
 
 
@@ -174,8 +174,8 @@ def _filtered(rows: Bytes, kind: str) -> npt.NDArray[Any]:
         full = (1 << np.maximum(np.frexp(alpha)[1].astype(np.int64), 1)) - 1
         luma = signed[:, 0] & 2 * most + 1
         red, green = luma + signed[:, 1] - signed[:, 2], luma + signed[:, 2]
-        blue, kept = luma - signed[:, 1] - signed[:, 2], alpha & full >> 1
-        colours = np.stack([red, green, blue, kept << 1 | kept & 1], axis=1)
+        blue, alpha_bits = luma - signed[:, 1] - signed[:, 2], alpha & full >> 1
+        colours = np.stack([red, green, blue, alpha_bits << 1 | alpha_bits & 1], axis=1)
         colours = np.rint(colours * ((2 * most + 1) / full[:, None]))
         return np.asarray(colours, dtype=np.uint8 if stride == 4 else np.uint16)
     raise _damaged()

@@ -32,18 +32,20 @@ def unpack(document: GltfDocument) -> None:
     MissingExtraError : data are compressed by Draco, and DracoPy is not installed.
     """
     for number, view in enumerate(document.objects("bufferViews")):
-        held = next((one for name in MESHOPT if (one := extension_of(view, name))), None)
-        if held is not None and not document.has_buffer(view.get("buffer")):
-            data = _meshopt(document, held, f"buffer view {number}")
+        compression = next((one for name in MESHOPT if (one := extension_of(view, name))), None)
+        if compression is not None and not document.has_buffer(view.get("buffer")):
+            data = _meshopt(document, compression, f"buffer view {number}")
             plain = {"buffer": document.add_unpacked(data), "byteLength": len(data)}
-            kept = {name: view[name] for name in ("byteStride", "target", "name") if name in view}
-            document.objects("bufferViews")[number] = kept | plain
+            view_fields = {
+                name: view[name] for name in ("byteStride", "target", "name") if name in view
+            }
+            document.objects("bufferViews")[number] = view_fields | plain
     unpacked: dict[int, Any] = {}
     for number, mesh in enumerate(document.objects("meshes")):
         for primitive in mesh.get("primitives", ()):
-            held = extension_of(primitive, DRACO)
-            if held and not _has_data(document, primitive):
-                _draco(document, primitive, held, f"mesh {number}", unpacked)
+            compression = extension_of(primitive, DRACO)
+            if compression and not _has_data(document, primitive):
+                _draco(document, primitive, compression, f"mesh {number}", unpacked)
 
 
 def _meshopt(document: GltfDocument, held: dict[str, Any], what: str) -> bytes:
@@ -90,10 +92,10 @@ def _draco(
             ) from error
     mesh = unpacked[number]
     stored = {one["unique_id"]: one["data"] for one in mesh.attributes}
-    wanted = {name: stored.get(own) for name, own in inner(held, "attributes").items()}
-    wanted["indices"] = None if len(mesh.faces) == 0 else mesh.faces.reshape(-1, 1)
+    decoded_attributes = {name: stored.get(own) for name, own in inner(held, "attributes").items()}
+    decoded_attributes["indices"] = None if len(mesh.faces) == 0 else mesh.faces.reshape(-1, 1)
     for name, index in (*primitive["attributes"].items(), ("indices", primitive.get("indices"))):
-        values = wanted.get(name)
+        values = decoded_attributes.get(name)
         if index is None or values is None:
             continue
         accessor = element(accessors, index, f"an accessor ({name})")

@@ -72,9 +72,9 @@ def require_readable(document: GltfDocument) -> None:
     ------
     MeshFileError : the file requires such an extension, which the message names.
     """
-    known = _READ | COMPRESSIONS
+    readable = _READ | COMPRESSIONS
     for name in document.description.get("extensionsRequired", ()):
-        if name not in known and not (_APPEARANCE.search(name) or _MOTION.search(name)):
+        if name not in readable and not (_APPEARANCE.search(name) or _MOTION.search(name)):
             raise MeshFileError(
                 f"it needs the extension {quoted(name)}, which may change its shape and is not "
                 "read",
@@ -105,9 +105,9 @@ def notes_on_extensions(document: GltfDocument) -> Iterator[str]:
     ]
     if shaping:
         yield left_out_note("its clips animate what is not supported", shaping)
-    known = _READ | COMPRESSIONS
+    readable = _READ | COMPRESSIONS
     for name in dict.fromkeys(document.description.get("extensionsUsed", ())):
-        if name not in known and not _APPEARANCE.search(name):
+        if name not in readable and not _APPEARANCE.search(name):
             yield f"its extension {quoted(name)}, which may change its shape or pose, is not read"
 
 
@@ -129,16 +129,18 @@ def left_out_nodes(
     first_person = set(_first_person(document))
     left_out: set[int] = set()
     notes = []
-    for chosen, why in (
+    for hidden_nodes, why in (
         (_with_all_below(hidden, parents), "as its file hides it"),
         (_with_all_below(levels, parents), "as a lower level of detail"),
         (first_person, "as only the wearer of the avatar sees it"),
     ):
-        shown = sorted(number for number in chosen - left_out if "mesh" in nodes[number])
-        if shown:
-            names = (_called(document, "nodes", number) for number in shown)
+        hidden_meshes = sorted(
+            number for number in hidden_nodes - left_out if "mesh" in nodes[number]
+        )
+        if hidden_meshes:
+            names = (_called(document, "nodes", number) for number in hidden_meshes)
             notes.append(left_out_note(f"left out, {why}", names))
-        left_out |= chosen
+        left_out |= hidden_nodes
     return left_out, notes
 
 
@@ -153,8 +155,8 @@ def _with_all_below(chosen: Iterable[object], parents: npt.NDArray[np.int64]) ->
 def _first_person(document: GltfDocument) -> Iterator[int]:
     """Yield the nodes that VRM 1.0, or VRM 0.x by their meshes, shows to the wearer only."""
     for extension, key, kind in (("VRMC_vrm", "node", "type"), ("VRM", "mesh", "firstPersonFlag")):
-        seen = inner(extension_of(document.description, extension), "firstPerson")
-        for annotation in _listed(seen.get("meshAnnotations")):
+        first_person = inner(extension_of(document.description, extension), "firstPerson")
+        for annotation in _listed(first_person.get("meshAnnotations")):
             if (
                 isinstance(annotation, dict)
                 and str(annotation.get(kind)).lower() == "firstpersononly"
@@ -285,8 +287,10 @@ def read_nodes(document: GltfDocument) -> Scene:
 def _nodes(document: GltfDocument) -> Nodes:
     stored = document.objects("nodes")
     parents = _parents(stored)
-    own = [local_transform(node, f"node {number}") for number, node in enumerate(stored)]
-    order, local = parents_first(parents), np.reshape(own, (-1, 4, 4))
+    local_transforms = [
+        local_transform(node, f"node {number}") for number, node in enumerate(stored)
+    ]
+    order, local = parents_first(parents), np.reshape(local_transforms, (-1, 4, 4))
     return Nodes(parents, order, local, global_transforms(local[None], parents, order)[0])
 
 
@@ -305,18 +309,18 @@ def read_shown(document: GltfDocument) -> Scene:
     require_readable(document)
     unpack(document)
     parents, order, local, rest = _nodes(document)
-    shown, notes = _shown_primitives(document, parents)
-    if not shown:
+    primitives, notes = _shown_primitives(document, parents)
+    if not primitives:
         n_meshes = len(document.objects("meshes"))
         if not n_meshes and document.objects("animations"):
             raise NoMeshError(*NO_MESH)
         what = f"it holds {n_meshes} meshes, none of which shows triangles"
         raise MeshFileError(f"{what} ({'; '.join(notes)})" if notes else what)
     looks = GltfLooks(document)
-    parts = tuple(_part(document, primitive, rest, looks) for primitive in shown)
+    parts = tuple(_part(document, primitive, rest, looks) for primitive in primitives)
     defaults = tuple(
         _default_weights(document, shown_mesh, part)
-        for shown_mesh, part in zip(shown, parts, strict=True)
+        for shown_mesh, part in zip(primitives, parts, strict=True)
     )
     clips = read_clips(document, local, parents, order, parts, defaults)
     return Scene(
@@ -348,7 +352,7 @@ def _shown_primitives(
         for i, node in enumerate(document.objects("nodes"))
         if "mesh" in node and i in visible
     ]
-    shown: list[Primitive] = []
+    primitives: list[Primitive] = []
     n_vertices = n_others = 0
     for mesh, node in sorted(showing):
         placed = instances(document, node)
@@ -366,11 +370,11 @@ def _shown_primitives(
                 continue
             n_vertices += count * n_instances
             require_plausible_count(n_vertices, "vertices")
-            shown.append(Primitive(node, mesh, number, count, n_instances))
+            primitives.append(Primitive(node, mesh, number, count, n_instances))
     if n_others:
         were = "1 part {} was" if n_others == 1 else f"{n_others} parts {{}} were"
         notes.append(f"{were.format('without triangles (points, lines)')} left out")
-    return shown, (*notes, *notes_on_extensions(document))
+    return primitives, (*notes, *notes_on_extensions(document))
 
 
 def _parents(nodes: list[dict[str, Any]]) -> npt.NDArray[np.int64]:
@@ -591,7 +595,7 @@ def _sliders(document: GltfDocument, shown: Primitive, n: int) -> dict[str, Floa
 def _expressions(document: GltfDocument, shown: Primitive, n: int) -> dict[str, FloatArray]:
     """Return the weights that expressions of VRM 1.0 or 0.x add to a mesh's n morph targets."""
     vrm, old = (extension_of(document.description, name) for name in ("VRMC_vrm", "VRM"))
-    found: dict[str, FloatArray] = {}
+    weights_of_expression: dict[str, FloatArray] = {}
     kinds = (inner(inner(vrm, "expressions"), kind) for kind in ("preset", "custom"))
     named = [
         (name, _listed(inner(kind, name).get("morphTargetBinds")), ("node", shown.node), 1.0)
@@ -611,8 +615,8 @@ def _expressions(document: GltfDocument, shown: Primitive, n: int) -> dict[str, 
                 if type(target) is int and 0 <= target < n and isinstance(weight, int | float):
                     weights[target] += unit * weight
         if weights.any() and np.isfinite(weights).all():
-            found[name] = weights
-    return found
+            weights_of_expression[name] = weights
+    return weights_of_expression
 
 
 def _default_weights(document: GltfDocument, shown: Primitive, part: Part) -> FloatArray:

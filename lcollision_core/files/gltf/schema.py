@@ -268,8 +268,8 @@ class GltfDocument:
 
     def has_buffer(self, index: object) -> bool:
         """Whether a buffer has bytes; one without stands for compressed data."""
-        found = element(self.objects("buffers"), index, "the buffer")
-        return "uri" in found or index in self._buffers or (index == 0 and self._blob is not None)
+        buffer = element(self.objects("buffers"), index, "the buffer")
+        return "uri" in buffer or index in self._buffers or (index == 0 and self._blob is not None)
 
     def add_unpacked(self, data: bytes) -> int:
         """Add a buffer of uncompressed data, and return its index."""
@@ -630,9 +630,11 @@ def _plain(holder: dict[str, Any]) -> dict[str, Any]:
     extensions = holder.get("extensions")
     if not isinstance(extensions, dict) or extensions.keys().isdisjoint(COMPRESSIONS):
         return holder
-    kept = {name: extension for name, extension in extensions.items() if name not in COMPRESSIONS}
+    kept_extensions = {
+        name: extension for name, extension in extensions.items() if name not in COMPRESSIONS
+    }
     others = {name: item for name, item in holder.items() if name != "extensions"}
-    return others | {"extensions": kept} if kept else others
+    return others | {"extensions": kept_extensions} if kept_extensions else others
 
 
 PARTS: dict[str, tuple[float, ...]] = {

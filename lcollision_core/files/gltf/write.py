@@ -274,17 +274,17 @@ class _Maker:
         colours, primitives = linear_colours(look.colours), []
         colour_accessor: int | None = None
         for kind, (named, drawn) in enumerate(kinds.tolist()):
-            chosen = faces[kind_of.reshape(-1) == kind]
+            kind_faces = faces[kind_of.reshape(-1) == kind]
             dtype = np.uint16 if len(look.vertices) < _MOST_SHORT else np.uint32
-            indices = self._file.add_array(chosen.reshape(-1, 1).astype(dtype), target=INDICES)
-            own, colour = dict(attributes), colours[chosen[0, 0]]
-            if (colours[chosen] != colour).any():
+            indices = self._file.add_array(kind_faces.reshape(-1, 1).astype(dtype), target=INDICES)
+            kind_attributes, colour = dict(attributes), colours[kind_faces[0, 0]]
+            if (colours[kind_faces] != colour).any():
                 colour = np.ones(4)
                 if colour_accessor is None:
                     colour_accessor = self._vectors(colours)
-                own["COLOR_0"] = colour_accessor
+                kind_attributes["COLOR_0"] = colour_accessor
             name = part.materials[named] if 0 <= named < len(part.materials) else ""
-            primitive: dict[str, Any] = {"attributes": own, "indices": indices}
+            primitive: dict[str, Any] = {"attributes": kind_attributes, "indices": indices}
             material = look.materials[drawn]
             if name or material.texture is not None or (colour != 1.0).any():
                 primitive["material"] = self._material(name, material, colour)

@@ -73,10 +73,10 @@ def read(file: BinaryIO, _: object = None) -> Polygons:
         ]
     body = _Body(data, byte_order or "=")
     columns: dict[str, dict[str, _Column]] = {}
-    wanted = {"vertex", *_SURFACES} & {element.name for element in elements}
+    element_names = {"vertex", *_SURFACES} & {element.name for element in elements}
     for element in elements:
         columns[element.name] = body.read(element)
-        if wanted <= columns.keys():
+        if element_names <= columns.keys():
             break
     x, y, z = (columns["vertex"][axis][0] for axis in "xyz")
     all_sizes, all_corners = [], []

@@ -322,14 +322,19 @@ def _cut_by_shape(
     is_clipped = np.isin(which, clipped)
     if len(clipped):
         n_corners = np.bincount(which)[clipped] + 2
-        own = np.repeat(np.arange(len(clipped)), n_corners)
+        polygon_of_corner = np.repeat(np.arange(len(clipped)), n_corners)
         begin = np.cumsum(n_corners) - n_corners
-        corner = np.arange(len(own)) + (fans[starts[clipped], 0] - begin)[own]
-        from_first = (points[corner] - points[corner[begin[own]]]) / size[clipped][own, None]
+        corner = (
+            np.arange(len(polygon_of_corner))
+            + (fans[starts[clipped], 0] - begin)[polygon_of_corner]
+        )
+        from_first = (points[corner] - points[corner[begin[polygon_of_corner]]]) / size[clipped][
+            polygon_of_corner, None
+        ]
         across = np.cross(normals[clipped], np.eye(3)[np.abs(normals[clipped]).argmin(axis=1)])
         across /= np.linalg.norm(across, axis=1, keepdims=True)
         axes = np.stack([across, np.cross(normals[clipped], across)], axis=1)
-        flat = np.einsum("cij,cj->ci", axes[own], from_first)
+        flat = np.einsum("cij,cj->ci", axes[polygon_of_corner], from_first)
         ears, is_cut = _clip_ears(flat, begin, n_corners)
         is_doubtful[clipped] |= ~is_cut
         is_clipped[is_clipped] = np.repeat(is_cut, n_corners - 2)

@@ -121,8 +121,11 @@ class Bvh:
         """Yield, for each joint, the columns and axes of its channels of one kind."""
         first = 0
         for names in self.channels:
-            own = [place for place, name in enumerate(names) if name in kinds]
-            yield [first + place for place in own], "".join(names[place][0] for place in own)
+            columns = [place for place, name in enumerate(names) if name in kinds]
+            yield (
+                [first + place for place in columns],
+                "".join(names[place][0] for place in columns),
+            )
             first += len(names)
 
 
@@ -262,10 +265,10 @@ def _hierarchy(
             count = next_words(1)[0]
             if not count.isdecimal() or int(count) > len(_CHANNELS):
                 raise MeshFileError(f"a joint of it has {count} channels")
-            own = [_CHANNELS.get(name.casefold(), "") for name in next_words(int(count))]
-            if "" in own or len(set(own)) < len(own):
+            channel_kinds = [_CHANNELS.get(name.casefold(), "") for name in next_words(int(count))]
+            if "" in channel_kinds or len(set(channel_kinds)) < len(channel_kinds):
                 raise MeshFileError("one of its joints has unknown or repeated channels")
-            channels[open_[-1]] = tuple(own)
+            channels[open_[-1]] = tuple(channel_kinds)
         else:
             raise MeshFileError(f"its hierarchy has an unexpected {word[:40]!r}")
     if open_ or not names:
@@ -275,8 +278,8 @@ def _hierarchy(
 
 
 def _value(rows: list[str], lines: list[int], number: int, name: str) -> float:
-    said, colon, value = (rows[lines[number]] if number < len(lines) else "").partition(":")
-    if " ".join(said.split()).casefold() + colon != name.casefold():
+    label, colon, value = (rows[lines[number]] if number < len(lines) else "").partition(":")
+    if " ".join(label.split()).casefold() + colon != name.casefold():
         raise MeshFileError(f"it does not say {name!r} after MOTION")
     return _number(value.strip())
 

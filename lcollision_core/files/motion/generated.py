@@ -109,14 +109,14 @@ def read_generated(path: str | os.PathLike[str]) -> list[NodeMotion]:
         arrays, _ = read_npz(Path(path), [(_PLACES,), (_TURNS,)])
         places = _usable(arrays[_PLACES], _PLACES)
         turns = _usable(arrays[_TURNS], _TURNS)
-        known = _SKELETONS.get(places.shape[1]) if places.ndim == 3 else None
-        if known is None or places.shape[2] != 3 or turns.shape != (*places.shape, 3):
+        skeleton = _SKELETONS.get(places.shape[1]) if places.ndim == 3 else None
+        if skeleton is None or places.shape[2] != 3 or turns.shape != (*places.shape, 3):
             sizes = " or ".join(map(str, _SKELETONS))
             raise MeshFileError(
                 f"{_PLACES!r} is {places.shape} and {_TURNS!r} {turns.shape}, expected (T, J, 3) "
                 f"and (T, J, 3, 3) of Kimodo with J = {sizes} joints"
             )
-        what, parents = known
+        what, parents = skeleton
         note = f"taken for a motion of Kimodo on the skeleton of {what}"
         n_frames, cut = _filled(places)
         places, turns = places[:n_frames], turns[:n_frames]
@@ -217,8 +217,8 @@ def _joints_of_vectors(vectors: FloatArray) -> FloatArray:
     steps = np.zeros((len(vectors), 3))
     steps[1:, [0, 2]] = vectors[:-1, 1:3]
     roots = np.cumsum(turns.apply(steps), axis=0)
-    seen = vectors[:, 4 : 4 + 3 * (len(_SMPL) - 1)].reshape(len(vectors), -1, 3)
-    places = np.einsum("txy,tjy->tjx", turns.as_matrix(), seen) + roots[:, None]
+    local_positions = vectors[:, 4 : 4 + 3 * (len(_SMPL) - 1)].reshape(len(vectors), -1, 3)
+    places = np.einsum("txy,tjy->tjx", turns.as_matrix(), local_positions) + roots[:, None]
     roots[:, 1] = vectors[:, 3]
     return np.concatenate([roots[:, None], places], axis=1)
 
@@ -247,17 +247,21 @@ def _motion(
 ) -> NodeMotion:
     """Return the motion of joints with these global positions and rotations."""
     parents = np.array(list(skeleton.values()))
-    seen, local = places.copy(), turns.copy()
+    root_places, local = places.copy(), turns.copy()
     for joint, parent in enumerate(parents.tolist()):
         if parent >= 0:
             back = np.swapaxes(turns[:, parent], 1, 2)
             local[:, joint] = back @ turns[:, joint]
-            seen[:, joint] = np.einsum("txy,ty->tx", back, places[:, joint] - places[:, parent])
-    offsets = seen.mean(axis=0) * (parents >= 0)[:, None]
+            root_places[:, joint] = np.einsum(
+                "txy,ty->tx", back, places[:, joint] - places[:, parent]
+            )
+    offsets = root_places.mean(axis=0) * (parents >= 0)[:, None]
     axes = np.broadcast_to(np.eye(3), (len(parents), 3, 3)).copy()
     times, ends = np.arange(len(places)) / rate, np.full(offsets.shape, np.nan)
     names = tuple(skeleton)
-    return NodeMotion("", names, parents, offsets, ends, axes, times, None, local, seen, notes)
+    return NodeMotion(
+        "", names, parents, offsets, ends, axes, times, None, local, root_places, notes
+    )
 
 
 def _fitted(places: FloatArray, what: str) -> NodeMotion:
@@ -277,11 +281,15 @@ def _fitted(places: FloatArray, what: str) -> NodeMotion:
             at_rest = turns[:, joint] @ _rest_way(names[int(below[0])])
             turns[:, joint] = least_turns(at_rest, way) @ turns[:, joint]
     motion = _motion(_SMPL, places, turns, _HUMANML_RATE, ())
-    shown = places.copy()
+    fitted_places = places.copy()
     for joint, parent in enumerate(parents.tolist()):
         if parent >= 0:
-            shown[:, joint] = shown[:, parent] + turns[:, parent] @ motion.offsets[joint]
-    off = np.linalg.norm(shown - places, axis=2) / max(float(np.ptp(places[0], axis=0).max()), 1e-9)
+            fitted_places[:, joint] = (
+                fitted_places[:, parent] + turns[:, parent] @ motion.offsets[joint]
+            )
+    off = np.linalg.norm(fitted_places - places, axis=2) / max(
+        float(np.ptp(places[0], axis=0).max()), 1e-9
+    )
     note = (
         f"taken for the joints {what}, whose turns are fitted by inverse kinematics: joints are "
         f"{100.0 * off.mean():.2g} % of the figure's size off on average, "

@@ -139,12 +139,12 @@ def motions_of_scene(
         raise MeshFileError("it has no animation", "export it with its animation")
     nodes = skeleton_nodes(scene)
     names = [scene.node_names[node] for node in nodes]
-    chosen = [scene_clip for scene_clip in scene.clips if clip in (None, scene_clip.name)]
-    if not chosen:
+    named_clips = [scene_clip for scene_clip in scene.clips if clip in (None, scene_clip.name)]
+    if not named_clips:
         # This raises an error that lists the clips.
         sample_clip(scene, clip or "", None)
     motions = []
-    for chosen_clip in chosen:
+    for chosen_clip in named_clips:
         rate: float | FloatArray | None = fps
         if most is not None:
             times = chosen_clip.times(fps)
@@ -161,14 +161,14 @@ def skeleton_nodes(scene: Scene) -> list[int]:
     that moves or branches.
     """
     order, parents = parents_first(scene.parents), scene.parents.tolist()
-    own: set[int] = set()
+    below_root: set[int] = set()
     for node in order:
-        is_below = not scene.bound or parents[node] in own
+        is_below = not scene.bound or parents[node] in below_root
         if node in scene.bound or (is_below and node not in scene.showing):
-            own.add(node)
+            below_root.add(node)
     below = dict.fromkeys(order, 0)
     for node in reversed(order):
-        below[node] += node in own
+        below[node] += node in below_root
         if parents[node] >= 0:
             below[parents[node]] += below[node]
     roots = [node for node in order if parents[node] < 0]
@@ -179,11 +179,11 @@ def skeleton_nodes(scene: Scene) -> list[int]:
         if len(children) != 1:
             break
         (root,) = children
-    kept = {root}
+    nodes = {root}
     for node in order:
-        if parents[node] in kept and below[node]:
-            kept.add(node)
-    return [node for node in order if node in kept]
+        if parents[node] in nodes and below[node]:
+            nodes.add(node)
+    return [node for node in order if node in nodes]
 
 
 def rotations_of(transforms: FloatArray) -> FloatArray:

@@ -179,9 +179,9 @@ def read_smpl_motion(path: str | os.PathLike[str], hands: _Hands | None = None) 
     MeshFileError : the file is missing, damaged, has Python objects, or no usable motion. The
         message names the file.
     """
-    known = (*_KEYS, *_TRANS, *_RATES, "betas", _FLAT)
+    keys = (*_KEYS, *_TRANS, *_RATES, "betas", _FLAT)
     try:
-        arrays, names = read_npz(Path(path), [(name,) for name in known])
+        arrays, names = read_npz(Path(path), [(name,) for name in keys])
         return _motion(Path(path), arrays, names, hands or {})
     except LCollisionError as error:
         raise MeshFileError.unreadable(path, error, _AGAIN) from error

@@ -76,8 +76,8 @@ class Laid:
         n = int(self.corners.max()) + 1
         keys = np.repeat(np.arange(len(self.sizes)), self.sizes) * n + self.corners
         order = np.argsort(keys, kind="stable")
-        wanted = self.polygon_of[:, None] * n + self.faces
-        return order[np.searchsorted(keys, wanted, sorter=order)]
+        face_keys = self.polygon_of[:, None] * n + self.faces
+        return order[np.searchsorted(keys, face_keys, sorter=order)]
 
 
 class FbxLooks:
@@ -115,8 +115,10 @@ class FbxLooks:
             except MeshFileError as error:
                 textures.append(None)
                 notes.append(error.headline)
-        own = [None if number < 0 else textures[number] for number in self._found["texture_of"]]
-        return [Material(texture) for texture in [*own, None]], notes
+        material_textures = [
+            None if number < 0 else textures[number] for number in self._found["texture_of"]
+        ]
+        return [Material(texture) for texture in [*material_textures, None]], notes
 
     def _beside(self, name: str) -> bytes:
         """Read a texture file by name, beside the FBX file or in usual folders."""
@@ -143,8 +145,8 @@ class FbxLooks:
             colours = looks[prefix + "colours"][laid.is_used]
         # The last material is for faces without one.
         numbers = np.append(looks[prefix + "materials"], len(materials) - 1)
-        chosen = np.where(laid.material_of < len(numbers) - 1, laid.material_of, -1)
-        material_of = numbers[chosen]
+        material_numbers = np.where(laid.material_of < len(numbers) - 1, laid.material_of, -1)
+        material_of = numbers[material_numbers]
         # Corners are not shared between polygons, so each has one material.
         of_corner = np.zeros(n, dtype=np.int64)
         of_corner[faces] = material_of[:, None]
@@ -161,16 +163,16 @@ class FbxLooks:
             normals = normals if np.isfinite(normals).all() else np.zeros((n, 0))
         # Merge equal corners into one point.
         alike = np.column_stack([laid.corners, uv, painted, normals])
-        _, kept, point_of = np.unique(alike, axis=0, return_index=True, return_inverse=True)
+        _, first_points, point_of = np.unique(alike, axis=0, return_index=True, return_inverse=True)
         return Appearance(
-            laid.corners[kept],
+            laid.corners[first_points],
             point_of.reshape(-1)[faces],
-            uv[kept].astype(np.float32),
-            painted[kept].astype(np.uint8),
+            uv[first_points].astype(np.float32),
+            painted[first_points].astype(np.uint8),
             material_of,
             tuple(materials),
             tuple(notes),
-            normals[kept].astype(np.float32) if normals.size else None,
+            normals[first_points].astype(np.float32) if normals.size else None,
         )
 
 
@@ -212,17 +214,17 @@ def read_shown(source: FbxDocument) -> Scene:
     if cached := answer["cached"].tolist():
         why = "not animated, as their geometry cache is not read (export PC2 or MDD instead)"
         notes.append(left_out_note(why, cached))
-    shown = answer["shown"].tolist()
+    shown_nodes = answer["shown"].tolist()
     numbers, parts = [], []
-    for number, node in enumerate(shown):
+    for number, node in enumerate(shown_nodes):
         part = _part(_only(answer, number), number, node, answer["transforms"], looks, notes)
         if part is not None:
             numbers.append(number)
             parts.append(part)
-    if not shown and len(answer["clips"]):
+    if not shown_nodes and len(answer["clips"]):
         raise NoMeshError(*NO_MESH)
     if not parts:
-        raise MeshFileError(f"it holds {len(shown)} meshes, none of which shows faces")
+        raise MeshFileError(f"it holds {len(shown_nodes)} meshes, none of which shows faces")
     require_plausible_count(sum(len(part.points) for part in parts), "vertices")
     weights = tuple(answer[f"{number} weights"][None] for number in numbers)
     return Scene(
@@ -308,9 +310,9 @@ class FbxDocument:
             "most_memory": _MOST_MEMORY,
             "most_elements": 4 * MAX_FACES,
         }
-        code, answer, said = self._run(json.dumps(request).encode() + b"\n" + self.data)
+        code, answer, errors = self._run(json.dumps(request).encode() + b"\n" + self.data)
         if code == _REFUSED:
-            reason = said.decode(errors="replace").strip()[-200:]
+            reason = errors.decode(errors="replace").strip()[-200:]
             raise MeshFileError(f"it is a damaged or unsupported FBX file ({reason})")
         try:
             with np.load(io.BytesIO(answer), allow_pickle=False) as arrays:
@@ -338,7 +340,7 @@ class FbxDocument:
             watcher = threading.Thread(target=stop_when_cancelled)
             watcher.start()
             try:
-                output, said = process.communicate(request, timeout=_MOST_SECONDS)
+                output, errors = process.communicate(request, timeout=_MOST_SECONDS)
             except subprocess.TimeoutExpired as error:
                 raise MeshFileError(f"reading it took more than {_MOST_SECONDS} s") from error
             finally:
@@ -346,7 +348,7 @@ class FbxDocument:
                 ended.set()
                 watcher.join()
         self.job.check()
-        return process.returncode, output, said
+        return process.returncode, output, errors
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,17 +45,17 @@ def _kept(item: Any) -> Any:
 
 
 def _items(items: Any) -> Iterator[Any]:
-    kept = _kept(items)
-    for index in range(len(kept)):
-        yield _kept(kept[index])
+    item_list = _kept(items)
+    for index in range(len(item_list)):
+        yield _kept(item_list[index])
 
 
 def _array(items: Any, dtype: type, width: int | None = None) -> np.ndarray:
     """Copy a list of numbers; an empty list of ufbx has no type."""
-    kept = _kept(items)
-    if not len(kept):
+    item_list = _kept(items)
+    if not len(item_list):
         return np.empty((0,) if width is None else (0, width), dtype)
-    return np.array(kept, dtype=dtype)
+    return np.array(item_list, dtype=dtype)
 
 
 def _matrix(matrix: Any) -> np.ndarray:
@@ -69,8 +69,8 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
     nodes = list(_items(scene.nodes))
     parents = [_kept(node.parent) for node in nodes]
     settings = _kept(scene.settings)
-    shown = list(_shown(nodes))
-    if sum(mesh.num_vertices + mesh.num_indices for _, mesh in shown) > most_elements:
+    shown_meshes = list(_shown(nodes))
+    if sum(mesh.num_vertices + mesh.num_indices for _, mesh in shown_meshes) > most_elements:
         raise _TooLargeError(f"its meshes have more than {most_elements} vertices and corners")
     arrays: dict[str, np.ndarray] = {
         "names": np.array([node.name for node in nodes], dtype=np.str_),
@@ -83,11 +83,11 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
         "up": np.array(int(settings.axes.up)),
         "metres": np.array(settings.unit_meters),
         "fps": np.array(_frames_per_second(settings)),
-        "shown": np.array([node.typed_id for node, _ in shown], dtype=np.int64),
-        "unseen": np.array(_unseen(nodes, shown), dtype=np.str_),
-        "cached": np.array(_cached(shown), dtype=np.str_),
+        "shown": np.array([node.typed_id for node, _ in shown_meshes], dtype=np.int64),
+        "unseen": np.array(_unseen(nodes, shown_meshes), dtype=np.str_),
+        "cached": np.array(_cached(shown_meshes), dtype=np.str_),
     }
-    for number, (node, mesh) in enumerate(shown):
+    for number, (node, mesh) in enumerate(shown_meshes):
         part = _part(node, mesh, most_elements)
         arrays |= {f"{number} {name}": value for name, value in part.items()}
     clips = list(_clips(scene))
@@ -109,9 +109,9 @@ def _shown(nodes: list[Any]) -> Iterator[tuple[Any, Any]]:
 
     If all meshes of a file are hidden, all count as visible.
     """
-    shown = [(node, mesh) for node in nodes if (mesh := _kept(node.mesh)) is not None]
-    seen = [pair for pair in shown if pair[0].visible] or shown
-    for node, mesh in seen:
+    node_meshes = [(node, mesh) for node in nodes if (mesh := _kept(node.mesh)) is not None]
+    visible_meshes = [pair for pair in node_meshes if pair[0].visible] or node_meshes
+    for node, mesh in visible_meshes:
         parent = _kept(node.parent)
         if parent is not None and parent.attrib_type == ufbx.ElementType.LOD_GROUP:
             levels = [child.typed_id for child in _items(parent.children)]
@@ -122,9 +122,11 @@ def _shown(nodes: list[Any]) -> Iterator[tuple[Any, Any]]:
 
 def _unseen(nodes: list[Any], shown: list[tuple[Any, Any]]) -> list[str]:
     """Return the names of the nodes with a mesh that are not shown."""
-    seen = {node.typed_id for node, _ in shown}
+    shown_ids = {node.typed_id for node, _ in shown}
     return [
-        node.name for node in nodes if _kept(node.mesh) is not None and node.typed_id not in seen
+        node.name
+        for node in nodes
+        if _kept(node.mesh) is not None and node.typed_id not in shown_ids
     ]
 
 
@@ -220,7 +222,7 @@ def _looks(scene: Any) -> dict[str, np.ndarray]:
     names: list[str] = []
     clamps: list[list[bool]] = []
     arrays: dict[str, np.ndarray] = {}
-    known: dict[int, int] = {}
+    number_of_material: dict[int, int] = {}
     for material in _items(scene.materials):
         maps = _kept(material.pbr)
         base, factor = _kept(maps.base_color), _kept(maps.base_factor)
@@ -231,7 +233,7 @@ def _looks(scene: Any) -> dict[str, np.ndarray]:
         number = -1
         if files:
             texture = files[0]
-            number = known.setdefault(texture.typed_id, len(known))
+            number = number_of_material.setdefault(texture.typed_id, len(number_of_material))
             if number == len(names):
                 names.append(texture.relative_filename or texture.filename)
                 clamps.append([int(texture.wrap_u) == 1, int(texture.wrap_v) == 1])
@@ -285,13 +287,13 @@ def _weights(mesh: Any) -> np.ndarray:
 def _sampled(scene: Any, clip: int, times: list[float]) -> dict[str, np.ndarray]:
     stack, _ = list(_clips(scene))[clip]
     animation = _kept(stack.anim)
-    shown = [node.typed_id for node, _ in _shown(list(_items(scene.nodes)))]
+    shown_ids = [node.typed_id for node, _ in _shown(list(_items(scene.nodes)))]
     transforms, weights = [], []
     for time in times:
         posed = _kept(ufbx.evaluate_scene(scene, animation, time))
         nodes = list(_items(posed.nodes))
         transforms.append(np.stack([_matrix(node.node_to_world) for node in nodes]))
-        weights.append([_weights(_kept(nodes[number].mesh)) for number in shown])
+        weights.append([_weights(_kept(nodes[number].mesh)) for number in shown_ids])
         posed.free()
     arrays = {"transforms": np.stack(transforms)}
     for number in range(len(weights[0])):
@@ -312,13 +314,13 @@ def _limit_memory(n_bytes: int) -> None:
 def main() -> int:
     """Read standard input, write standard output, and return the exit status."""
     gc.disable()
-    asked = json.loads(sys.stdin.buffer.readline())
-    _limit_memory(asked["most_memory"])
+    request = json.loads(sys.stdin.buffer.readline())
+    _limit_memory(request["most_memory"])
     try:
         scene = _kept(
             ufbx.load_memory(
                 sys.stdin.buffer.read(),
-                ignore_embedded=not asked["looks"],
+                ignore_embedded=not request["looks"],
                 load_external_files=False,
                 clean_skin_weights=True,
                 skip_mesh_parts=True,
@@ -326,12 +328,12 @@ def main() -> int:
                 file_format=ufbx.FileFormat.FBX,
             )
         )
-        if asked["looks"]:
+        if request["looks"]:
             arrays = _looks(scene)
-        elif asked["times"] is None:
-            arrays = _described(scene, asked["most_elements"])
+        elif request["times"] is None:
+            arrays = _described(scene, request["most_elements"])
         else:
-            arrays = _sampled(scene, asked["clip"], asked["times"])
+            arrays = _sampled(scene, request["clip"], request["times"])
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, **arrays)
     except (ufbx.UfbxError, _TooLargeError) as error:

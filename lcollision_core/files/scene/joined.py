@@ -184,8 +184,10 @@ def sample_clip(
     """
     clips = [clip for clip in scene.clips if clip.name == name]
     if not clips:
-        known = ", ".join(repr(clip.name) for clip in scene.clips[:8]) or "none"
-        raise MeshFileError(f"it has no clip {name!r}, its clips are: {known}", "name one of them")
+        clip_names = ", ".join(repr(clip.name) for clip in scene.clips[:8]) or "none"
+        raise MeshFileError(
+            f"it has no clip {name!r}, its clips are: {clip_names}", "name one of them"
+        )
     times = fps if isinstance(fps, np.ndarray) else clips[0].times(fps)
     numbers_each = max(3 * n_vertices, 16 * len(scene.parents))
     if len(times) * numbers_each > MAX_FRAME_NUMBERS:
@@ -230,7 +232,7 @@ def join_parts(scene: Scene) -> JoinedMesh:
     keys = np.concatenate(
         [places.view(np.int64), bone_of, weights.view(np.int64), morph_of], axis=1
     )
-    kept, joined = _first_of_equal(keys)
+    first_vertices, joined = _first_of_equal(keys)
     faces = np.concatenate([joined[part.faces + first_vertex[i]] for i, part in enumerate(parts)])
     # The numbers of polygons need only ascend.
     n_before = np.cumsum([0] + [len(part.faces) for part in parts])
@@ -243,23 +245,25 @@ def join_parts(scene: Scene) -> JoinedMesh:
     is_flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     morphs = []
     for i, part in enumerate(parts):
-        local = kept[(kept >= first_vertex[i]) & (kept < first_vertex[i + 1])]
+        local = first_vertices[
+            (first_vertices >= first_vertex[i]) & (first_vertices < first_vertex[i + 1])
+        ]
         moved = local[morph_of[local, 0] > 0]
         if len(moved):
             deltas = part.morphs[:, moved - first_vertex[i]]
             morphs.append(_Morphs(i, joined[moved], deltas))
     is_skinned = np.repeat([part.is_skinned for part in parts], np.diff(first_vertex))
     mesh = JoinedMesh(
-        _topology(faces, is_flat, len(kept)),
+        _topology(faces, is_flat, len(first_vertices)),
         cut_of[~is_flat],
         joined,
         bones,
         bind,
-        bone_of[kept].astype(np.int32),
-        weights[kept],
-        points[kept],
-        is_skinned[kept],
-        dual[kept],
+        bone_of[first_vertices].astype(np.int32),
+        weights[first_vertices],
+        points[first_vertices],
+        is_skinned[first_vertices],
+        dual[first_vertices],
         tuple(morphs),
         (),
         (),
@@ -268,7 +272,7 @@ def join_parts(scene: Scene) -> JoinedMesh:
     flat = degenerate_faces(mesh.topology, mesh.posed(scene.rest)[0])
     is_flat[np.flatnonzero(~is_flat)[flat]] = True
     notes = list(scene.notes)
-    if n_joined := len(joined) - len(kept):
+    if n_joined := len(joined) - len(first_vertices):
         were = "vertex was" if n_joined == 1 else "vertices were"
         notes.append(f"{n_joined} {were} joined with others at seams")
     if n_flat := int(is_flat.sum()):
@@ -276,7 +280,7 @@ def join_parts(scene: Scene) -> JoinedMesh:
         notes.append(f"{n_flat} {were} left out")
     return replace(
         mesh,
-        topology=_topology(faces, is_flat, len(kept)),
+        topology=_topology(faces, is_flat, len(first_vertices)),
         cut_of=cut_of[~is_flat],
         groups=_groups(parts, is_flat),
         notes=tuple(notes),
@@ -303,7 +307,7 @@ def _common_bones(parts: tuple[Part, ...]) -> tuple[IntArray, FloatArray, IntArr
     bone_of : (W, I) int64 array, 0 where the weight is 0
     weights : (W, I) float64 array
     """
-    known: dict[tuple[int, bytes], int] = {}
+    number_of_bone: dict[tuple[int, bytes], int] = {}
     bones: list[int] = []
     binds: list[FloatArray] = []
     width = max(part.bone_of.shape[1] for part in parts)
@@ -314,11 +318,11 @@ def _common_bones(parts: tuple[Part, ...]) -> tuple[IntArray, FloatArray, IntArr
         numbers = np.empty(len(part.bones), dtype=np.int64)
         for i, (bone, bind) in enumerate(zip(part.bones.tolist(), part.bind + 0.0, strict=True)):
             key = bone, bind.tobytes()
-            if key not in known:
-                known[key] = len(bones)
+            if key not in number_of_bone:
+                number_of_bone[key] = len(bones)
                 bones.append(bone)
                 binds.append(bind)
-            numbers[i] = known[key]
+            numbers[i] = number_of_bone[key]
         rows = slice(start, start + len(part.points))
         start += len(part.points)
         columns = part.bone_of.shape[1]
@@ -336,20 +340,20 @@ def _morph_numbers(parts: tuple[Part, ...]) -> IntArray:
     result = [np.zeros((len(part.points), 2), dtype=np.int64) for part in parts]
     # The parts that one node shows share their weights.
     for node in {part.node for part in parts}:
-        shown = [i for i, part in enumerate(parts) if part.node == node and part.morphs.any()]
-        n_targets = max((len(parts[i].morphs) for i in shown), default=0)
+        node_parts = [i for i, part in enumerate(parts) if part.node == node and part.morphs.any()]
+        n_targets = max((len(parts[i].morphs) for i in node_parts), default=0)
         rows, deltas = [], []
-        for i in shown:
+        for i in node_parts:
             moved = np.flatnonzero(parts[i].morphs.any(axis=(0, 2)))
             given = np.zeros((len(moved), n_targets, 3), dtype=np.float32)
             given[:, : len(parts[i].morphs)] = parts[i].morphs[:, moved].transpose(1, 0, 2)
             rows.append(moved)
             deltas.append(given.reshape(len(moved), -1) + np.float32(0.0))
-        if not shown:
+        if not node_parts:
             continue
         _, kind = _first_of_equal(np.concatenate(deltas).view(np.int32))
         kinds = np.split(kind, np.cumsum([len(moved) for moved in rows])[:-1])
-        for i, moved, which in zip(shown, rows, kinds, strict=True):
+        for i, moved, which in zip(node_parts, rows, kinds, strict=True):
             result[i][moved, 0], result[i][moved, 1] = node + 1, which
     return np.concatenate(result)
 
@@ -377,13 +381,13 @@ def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tupl
         named = [(part.mesh, is_kept)]
         for index, name in enumerate(part.materials):
             named.append((name, is_kept & (part.material_of == index)))
-        for name, chosen in named:
+        for name, group_name in named:
             printable = "".join(filter(str.isprintable, name))[:MAX_GROUP_NAME_LENGTH]
             if printable.strip():
-                faces_of.setdefault(printable, []).append(number[rows[chosen]])
-                meshes |= {printable} if chosen is is_kept else set()
-    kept = list(faces_of.items())[:MAX_GROUPS]
+                faces_of.setdefault(printable, []).append(number[rows[group_name]])
+                meshes |= {printable} if group_name is is_kept else set()
+    group_faces = list(faces_of.items())[:MAX_GROUPS]
     return tuple(
         FaceGroup(name, np.unique(np.concatenate(faces)), is_material=name not in meshes)
-        for name, faces in kept
+        for name, faces in group_faces
     )

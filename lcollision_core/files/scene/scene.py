@@ -61,10 +61,8 @@ class ScenePoses:
 
     def part(self, pose: int) -> ScenePoses:
         """Return a single pose."""
-        chosen = slice(pose, pose + 1)
-        return ScenePoses(
-            self.transforms[chosen], tuple(of_part[chosen] for of_part in self.weights)
-        )
+        rows = slice(pose, pose + 1)
+        return ScenePoses(self.transforms[rows], tuple(of_part[rows] for of_part in self.weights))
 
 
 @dataclass(frozen=True)
@@ -195,11 +193,11 @@ class Clip:
         if fps is None:
             # Keys are stored in single precision, so tolerate a thousandth of a step.
             least_step = (1.0 - 1e-3) / MOST_KEYS_PER_SECOND
-            kept = [start]
+            key_times = [start]
             for time in self.key_times[1:].tolist():
-                if time - kept[-1] >= least_step:
-                    kept.append(time)
-            return np.array(kept)
+                if time - key_times[-1] >= least_step:
+                    key_times.append(time)
+            return np.array(key_times)
         if not 0.0 < fps < np.inf:
             raise MeshFileError.must_be("fps", "a number above 0", f"{fps:g}")
         # Keys are stored in single precision, so tolerate a hundredth of a frame.
@@ -257,11 +255,11 @@ class Scene:
 
 def by_node(parts: Sequence[Part], values: Sequence[FloatArray]) -> dict[int, FloatArray]:
     """Return the (N, M) morph target values of each node, the longest of its parts."""
-    found: dict[int, FloatArray] = {}
-    for part, own in zip(parts, values, strict=True):
-        if own.shape[1] > found.get(part.node, own[:, :0]).shape[1]:
-            found[part.node] = own
-    return found
+    value_of_node: dict[int, FloatArray] = {}
+    for part, value in zip(parts, values, strict=True):
+        if value.shape[1] > value_of_node.get(part.node, value[:, :0]).shape[1]:
+            value_of_node[part.node] = value
+    return value_of_node
 
 
 def character_parts(scene: Scene) -> list[int]:
@@ -419,10 +417,10 @@ def _revealed(scene: Scene, node: int) -> Scene:
     if not least < _HIDDEN * greatest:
         return scene
     # Choose a median frame, not one in which the node just grows or overshoots.
-    shown = sorted(
+    visible_frames = sorted(
         (frame for frame in frames if frame[0] >= 0.5 * greatest), key=lambda one: one[0]
     )
-    _, clip_name, frame = shown[len(shown) // 2]
+    _, clip_name, frame = visible_frames[len(visible_frames) // 2]
     below = [node]
     for other in parents_first(scene.parents):
         if scene.parents[other] in below:
@@ -486,12 +484,14 @@ def _seen_parts(scene: Scene) -> list[int]:
     """
     rest = scene.rest.transforms[0]
     sizes = np.array([_largest_size(part, rest) for part in scene.parts])
-    seen = sizes >= _INVISIBLE * sizes.max()
+    is_visible = sizes >= _INVISIBLE * sizes.max()
     if any(part.is_skinned for part in scene.parts):
         for number, part in enumerate(scene.parts):
             carriers = [part.node, *_ancestors(scene, part.node)]
-            seen[number] &= part.is_skinned or any(is_regular(rest[node]) for node in carriers)
-    return [number for number, is_seen in enumerate(seen) if is_seen or not seen.any()]
+            is_visible[number] &= part.is_skinned or any(
+                is_regular(rest[node]) for node in carriers
+            )
+    return [number for number, is_seen in enumerate(is_visible) if is_seen or not is_visible.any()]
 
 
 def _largest_size(part: Part, transforms: FloatArray) -> float:

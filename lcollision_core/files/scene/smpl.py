@@ -144,10 +144,18 @@ def read_smpl(path: str | os.PathLike[str]) -> SmplModel:
     MeshFileError : the file is missing, damaged, has Python objects or other content, or has other
         joints. The message names the file.
     """
-    wanted = ("v_template", "shapedirs", "posedirs", "weights", "kintree_table", "f", _REGRESSOR)
+    array_names = (
+        "v_template",
+        "shapedirs",
+        "posedirs",
+        "weights",
+        "kintree_table",
+        "f",
+        _REGRESSOR,
+    )
     sparse = [f"{_REGRESSOR}_{part}" for part in _SPARSE]
     try:
-        arrays, names = read_npz(Path(path), [(name,) for name in (*wanted, *sparse)])
+        arrays, names = read_npz(Path(path), [(name,) for name in (*array_names, *sparse)])
         if "v_template" not in arrays and {"poses", "trans"} & set(names):
             raise MeshFileError("it is a motion, not a body", "name its body model first")
         if "v_template" not in arrays and "vertices" in names:
@@ -262,11 +270,11 @@ def _plain(
         for own, size in zip(array.shape, shape, strict=True)
     )
     if not fits or array.dtype.kind not in kinds:
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        shape_text = ", ".join("any" if size is None else str(size) for size in shape)
         raise MeshFileError(
             "cannot be used",
             where=f"its array {name!r}",
-            expected=f"{'numbers' if 'f' in kinds else 'whole numbers'} of shape ({wanted})",
+            expected=f"{'numbers' if 'f' in kinds else 'whole numbers'} of shape ({shape_text})",
             got=f"{array.dtype} {array.shape}",
         )
     return array
