@@ -350,7 +350,7 @@ class PoseMirror:
         else:
             # The placement stays fixed: a fitted rigid motion would have to be undone, and the
             # codes represent it nearly as well.
-            image_latent = self._codes_of_image(pose, image, job)
+            image_latent = self.codes_of_image(pose, image, job)
         check = replace(check, placement=image_placement)
         mirrored = check.decode(image_latent)[0]
         pairs_mirrored = pairs_after = len(check.find(check.exported(mirrored)).pairs)
@@ -360,7 +360,7 @@ class PoseMirror:
             if resolution.exactly_free:
                 image_latent, pairs_after = resolution.latent, 0
                 mirrored = check.decode(image_latent)[0]
-        distances = self._misfit(pose, image_latent, mirrored - image)
+        distances = self.misfit(pose, image_latent, mirrored - image)
         return MirroredPose(
             latent=image_latent,
             placement=image_placement,
@@ -376,7 +376,7 @@ class PoseMirror:
             ),
         )
 
-    def _misfit(
+    def misfit(
         self,
         latent: FloatArray,  # noqa: ARG002 - used by `RigMirror`
         mirrored: FloatArray,  # noqa: ARG002
@@ -392,7 +392,7 @@ class PoseMirror:
         distances: FloatArray = np.linalg.norm(off[self.check.space.topology.picked], axis=1)
         return distances
 
-    def _codes_of_image(
+    def codes_of_image(
         self,
         latent: FloatArray,  # noqa: ARG002 - used by `RigMirror`
         image: FloatArray,
@@ -433,7 +433,7 @@ class PoseMirror:
         """
         size = self.check.body_size
         image = self.symmetry.image(self.check.decode(latent)[0] * size) / size
-        mirrored = self._codes_of_image(latent, image, job)
+        mirrored = self.codes_of_image(latent, image, job)
         other = self.partner(domain)
         other_codes = self.check.space.codes_of([] if other is None else [other])
         return np.where(other_codes, mirrored, latent)
@@ -690,12 +690,13 @@ class RigMirror(PoseMirror):
     space: RigPoseSpace
     sides: JointSides
 
-    def _codes_of_image(
+    def codes_of_image(
         self,
         latent: FloatArray,
         image: FloatArray,  # noqa: ARG002 - joints are more reliable than vertices
         job: Job,  # noqa: ARG002 - a single step
     ) -> FloatArray:
+        """Return the codes of the mirrored joints."""
         flip, sides = self.symmetry.flip, self.sides
         moved = self.space.transforms(latent) @ np.linalg.inv(self.space.rig.rest)
         mirrored = flip @ moved[sides.partner] @ flip
@@ -710,13 +711,13 @@ class RigMirror(PoseMirror):
         codes[stays] = latent[stays]
         return codes
 
-    def _misfit(
+    def misfit(
         self,
         latent: FloatArray,
         mirrored: FloatArray,
         off: FloatArray,
     ) -> FloatArray:
-        # Measure at the joints, as the sides of the mesh may differ.
+        """Measure at the joints, as the sides of the mesh may differ."""
         places = self.space.transforms(latent)[self.sides.partner, :3, 3]
         off = self.space.transforms(mirrored)[:, :3, 3] - self.symmetry.reflect(places)
         distances: FloatArray = np.linalg.norm(off[self.sides.partner >= 0], axis=1)

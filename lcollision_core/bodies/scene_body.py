@@ -14,7 +14,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from lcollision_core.bodies.body import Body, ModelCard, read_only
-from lcollision_core.bodies.mirror import Symmetry
+from lcollision_core.bodies.mirror import PoseMirror, Symmetry
 from lcollision_core.bodies.names import (
     MAX_NAME_LENGTH,
     SHAPES,
@@ -24,6 +24,7 @@ from lcollision_core.bodies.names import (
     LatentSpace,
     unique_names,
 )
+from lcollision_core.bodies.rig_poses import StarterPose
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.bodies.scene_space import PlacedSpace, SceneSpace, StillSpace
 from lcollision_core.contact import CollisionDetector, ContactRules
@@ -151,8 +152,6 @@ class SceneBody(Body):
     vertices_of, faces_of : slices of each member's vertices and faces, by name
     """
 
-    no_sides = ("it has several bodies", "mirror the pose of each by itself")
-
     def __init__(
         self, members: Sequence[SceneMember], name: str = "", file: SceneFile | None = None
     ) -> None:
@@ -187,6 +186,9 @@ class SceneBody(Body):
             np.zeros((1, len(space.low))),
         )
         self.own_card = card
+        several = "it has several bodies", "mirror the pose of each by itself"
+        only = self.only_posed
+        self.no_sides = several if only is None else only.body.no_sides
         self.notes = tuple(
             f"{member.name}: {note}" for member in members for note in member.body.notes
         )
@@ -206,6 +208,24 @@ class SceneBody(Body):
                 stands[rows] = False
                 return float((self.reference[rows] @ self.up).max()) / self.body_size, stands
         return None
+
+    @cached_property
+    def only_posed(self) -> SceneMember | None:
+        """The body that is posed; None if several are, or if props have the names of its parts.
+
+        Its parts keep their names, and its poses can be mirrored.
+        """
+        posed = [member for member in self.standing if member.moves and not member.is_fixed]
+        if len(posed) != 1:
+            return None
+        body = posed[0].body
+        parts = {*body.domain_names, *body.shape_names, *(group.name for group in body.groups)}
+        return posed[0] if parts.isdisjoint(member.name for member in self.members) else None
+
+    def _in_body(self, body: str, part: str) -> str:
+        """Name a part of a body of the scene, as in "hero: left hand"."""
+        is_only = self.only_posed is not None and self.only_posed.name == body
+        return part if is_only else f"{body}: {part}"
 
     @property
     def plays(self) -> dict[str, tuple[str, float]]:
@@ -260,7 +280,7 @@ class SceneBody(Body):
         for member in self.standing:
             own = member.body.domain_names if member.moves else ("",)
             several = len(own) > 1
-            names += [_in_body(member.name, part) if several else member.name for part in own]
+            names += [self._in_body(member.name, part) if several else member.name for part in own]
             colours += member.body.card.domain_colours if member.moves else (_GREY,)
             held_names = [other.name for other in self.members if other.holder == member.name]
             names += held_names
@@ -288,13 +308,15 @@ class SceneBody(Body):
             for group in member.body.groups:
                 pieces = group.name.split(", ", 1)
                 in_pieces = len(pieces) > 1 and own.issuperset(pieces)
-                label = ", ".join(_in_body(name, piece) for piece in pieces) if in_pieces else ""
-                called = label or _in_body(name, group.name)
+                label = (
+                    ", ".join(self._in_body(name, piece) for piece in pieces) if in_pieces else ""
+                )
+                called = label or self._in_body(name, group.name)
                 groups.append(replace(group, name=called, faces=group.faces + rows.start))
-            ignored += [(_in_body(name, a), _in_body(name, b)) for a, b in rules.ignored]
-            left_out += [_in_body(name, name_left_out) for name_left_out in rules.left_out]
+            ignored += [(self._in_body(name, a), self._in_body(name, b)) for a, b in rules.ignored]
+            left_out += [self._in_body(name, name_left_out) for name_left_out in rules.left_out]
             tolerated += [
-                (_in_body(name, a), _in_body(name, b), depth)
+                (self._in_body(name, a), self._in_body(name, b), depth)
                 for a, b, depth in rules.tolerated_pairs
             ]
             if rules.tolerated_depth:
@@ -304,7 +326,7 @@ class SceneBody(Body):
                 ignored.append((name, name))
             if member.holder is not None:
                 holding = self._part_of(member)
-                grip = _in_body(name, "grip")
+                grip = self._in_body(name, "grip")
                 inside = domains[self._space.topology.faces[:, 0]] == holding
                 groups.append(FaceGroup(grip, np.flatnonzero(inside)))
                 ignored.append((name, grip))
@@ -434,10 +456,60 @@ class SceneBody(Body):
         """(3,) unit vector along an axis: the direction that the first body faces."""
         return self.members[0].body.front
 
-    @property
+    @cached_property
     def symmetry(self) -> Symmetry | None:
-        """None: each body has its own."""
-        return None
+        """That of the only body that is posed; the partner of any other vertex is itself."""
+        only = self.only_posed
+        own = None if only is None else only.body.symmetry
+        if only is None or own is None:
+            return None
+        rows, place = self.vertices_of[only.name], only.place
+        partner = np.arange(self.n_vertices, dtype=np.int32)
+        partner[rows] = own.partner + rows.start
+        normal = place.rotation @ own.normal
+        offset = place.scale * own.offset + float(place.translation @ normal)
+        return Symmetry(read_only(partner), normal, offset)
+
+    @cached_property
+    def pose_mirror(self) -> PoseMirror:
+        """Mirrors poses of the only body that is posed; all else keeps its codes.
+
+        Raises
+        ------
+        LCollisionError : several bodies are posed, or the body is not symmetric.
+        """
+        only, symmetry = self.only_posed, self.symmetry
+        if only is None or symmetry is None:
+            raise self._not_mirrored()
+        at = self.standing.index(only)
+        space = self._space
+        return _MirrorOfOne(
+            self.attention_mask,
+            symmetry,
+            self.exact_check(),
+            self.nearest,
+            self.resolve,
+            only.body.pose_mirror,
+            space.members[at],
+            space.codes[at],
+            space.vertices[at],
+            space.domains[at].start,
+        )
+
+    @property
+    def starter_poses(self) -> tuple[StarterPose, ...]:
+        """Those of the only body that is posed."""
+        only = self.only_posed
+        if only is None:
+            return ()
+        own = self._space.codes[self.standing.index(only)]
+        poses = []
+        for pose in only.body.starter_poses:
+            codes, moves = np.zeros(self.latent_size), np.zeros(self.latent_size, dtype=np.bool_)
+            codes[own] = pose.codes
+            moves[own] = True if pose.moves is None else pose.moves
+            poses.append(StarterPose(pose.name, read_only(codes), moves))
+        return tuple(poses)
 
     @cached_property
     def appearance(self) -> Appearance | None:
@@ -493,14 +565,14 @@ class SceneBody(Body):
         n_whole = self._space.group_sizes[0]
         for member, own in zip(self.standing, self._space.codes, strict=True):
             for place, name in zip(own.tolist(), _of_codes(member, "code_names"), strict=True):
-                names[place] = _in_body(member.name, name) if place < n_whole else name
+                names[place] = self._in_body(member.name, name) if place < n_whole else name
         return (*names[: sum(self._space.group_sizes)], *self.shape_names)
 
     @property
     def shape_names(self) -> tuple[str, ...]:
         """The bodies' shape names, prefixed with the body's name."""
         return tuple(
-            _in_body(member.name, name)
+            self._in_body(member.name, name)
             for member in self.standing
             if member.moves
             for name in member.body.shape_names
@@ -528,7 +600,7 @@ class SceneBody(Body):
             shown[own] = of_member.shown
             labels = [name for group in of_member.groups for name in group.code_names]
             for place, name, unit in zip(own.tolist(), labels, of_member.units, strict=True):
-                code_names[place] = _in_body(member.name, name) if place < n_whole else name
+                code_names[place] = self._in_body(member.name, name) if place < n_whole else name
                 units[place] = unit
         ends = np.cumsum(self._space.group_sizes).tolist()
         shapes = LatentGroup(SHAPES, None, self.shape_codes, self.shape_names)
@@ -672,6 +744,41 @@ class SceneBody(Body):
         return np.array(self.apart(latent)).reshape(-1, self.latent_size)
 
 
+@dataclass(frozen=True, eq=False)
+class _MirrorOfOne(PoseMirror):
+    """Mirrors the poses of one body of a scene.
+
+    Attributes
+    ----------
+    own : mirrors that body
+    placed, codes, rows : its pose space, codes and vertices in the scene
+    first : its first domain
+    """
+
+    own: PoseMirror
+    placed: PlacedSpace
+    codes: npt.NDArray[np.intp]
+    rows: slice
+    first: int
+
+    def codes_of_image(self, latent: FloatArray, image: FloatArray, job: Job) -> FloatArray:
+        mirrored, back = latent.copy(), self.placed.place.inverse()
+        mirrored[self.codes] = self.own.codes_of_image(
+            latent[self.codes], back.apply(image[self.rows]), job
+        )
+        return mirrored
+
+    def misfit(self, latent: FloatArray, mirrored: FloatArray, off: FloatArray) -> FloatArray:
+        scale = self.placed.place.scale
+        own = self.placed.turned_back(off[self.rows]) / scale**2
+        return scale * self.own.misfit(latent[self.codes], mirrored[self.codes], own)
+
+    def partner(self, domain: int) -> int | None:
+        """Return the domain on the other side; None if it is in the middle or has no match."""
+        other = self.own.partner(domain - self.first)
+        return None if other is None else other + self.first
+
+
 def as_scene(body: Body) -> SceneBody | None:
     """Return a body as a scene of several bodies; None for a single body."""
     return body if isinstance(body, SceneBody) else None
@@ -702,11 +809,6 @@ class SceneResolver(PoseResolver):
 
     def _known_free(self, target: FloatArray) -> FloatArray:
         return np.concatenate([self._starts(target, self.check), super()._known_free(target)])
-
-
-def _in_body(body: str, part: str) -> str:
-    """Name a part of a scene's body, as in "hero: left hand"."""
-    return f"{body}: {part}"
 
 
 def _bends(body: Body) -> bool:

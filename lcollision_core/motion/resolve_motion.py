@@ -202,8 +202,8 @@ def _each_by_itself(
 ) -> Motion:
     """Return the motion of a scene with the self-collisions of each body resolved.
 
-    Most collisions are within one body, and alone it is cheaper to decode, search and solve. After a
-    stop the remaining bodies stay unchanged.
+    Most collisions are within one body, and alone it is cheaper to decode, search and solve. After
+    a stop the remaining bodies stay unchanged.
     """
     motion, options, space_at = run.motion, run.options, run.motion.space_at
     codes = np.array(motion.codes)
@@ -384,7 +384,7 @@ class _Resolution:
         )
 
     def judged(self, other: ResolvedMotion) -> ResolvedMotion | None:
-        """Return another result for the motion; None if it makes a frame worse than the original."""
+        """Return another result for the motion; None if it makes a frame worse."""
         codes, after = other.motion.codes, other.after[: self.n].copy()
         if self.guard.faults(range(self.n), codes[: self.n], after, self._fractions):
             return None

@@ -135,6 +135,22 @@ def test_a_fixed_body_does_not_give_way(folder: Path) -> None:
     assert body.codes_of_member("hero", result.latent).any()
 
 
+def test_the_only_body_that_is_posed_keeps_its_names_and_its_mirror(folder: Path) -> None:
+    hero = open_body(folder / "hero.glb")
+    parts = ScenePart(str(folder / "hero.glb")), ScenePart(str(folder / "box.obj"), fixed=True)
+    body = body_of_scene(SceneFile(parts, "rest"))
+    assert body.domain_names == (*hero.domain_names, "box", "ground")
+    assert {group.name for group in hero.groups} < {group.name for group in body.groups}
+    codes = 0.3 * hero.sample(1, np.random.default_rng(5))[0]
+    mirrored, expected = body.mirror(body.joined_codes([codes, None, None])), hero.mirror(codes)
+    if mirrored.resolution is None and expected.resolution is None:
+        own = body.codes_of_member("hero", mirrored.latent)
+        np.testing.assert_allclose(own, expected.latent, atol=1e-12)
+    hand = hero.domain_names.index("Left hand")
+    assert body.pose_mirror.partner(hand) == hero.pose_mirror.partner(hand) is not None
+    assert [p.name for p in body.starter_poses] == [p.name for p in hero.starter_poses]
+
+
 def test_a_drag_moves_the_body_that_is_held_alone(two: SceneBody) -> None:
     dragger, start = two.dragger(), two.apart(np.zeros(two.latent_size))[0]
     decoded = two.decode(start)
