@@ -325,6 +325,7 @@ def test_a_greyed_action_says_why(qtbot: QtBot, tmp_path: Path, arm_file: Path) 
     close_window(window)
 
 
+@pytest.mark.slow
 def test_starter_poses_are_loaded_and_those_of_hands_change_hands_only(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:

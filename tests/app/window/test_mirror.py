@@ -148,6 +148,7 @@ def mirror_by_menu(qtbot: QtBot, window: MainWindow, place: QPoint, picture: str
     return next(sentence for sentence in told if "irror" in sentence)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
 def test_a_library_is_mirrored_and_back_to_the_bit(
     qtbot: QtBot, window: MainWindow, body: LearnedBody, theme: object

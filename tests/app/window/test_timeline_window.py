@@ -479,6 +479,7 @@ def test_the_camera_follows_a_body_that_walks_until_it_is_told_not_to(
     assert not in_picture(back)
 
 
+@pytest.mark.slow
 def test_a_resolve_shows_how_far_it_is_and_is_cancelled_where_it_was_begun(
     qtbot: QtBot, swinging: MainWindow
 ) -> None:
@@ -506,6 +507,7 @@ def test_a_resolve_shows_how_far_it_is_and_is_cancelled_where_it_was_begun(
     assert any(words.endswith(" frames, less than a minute left") for words in said)
 
 
+@pytest.mark.slow
 def test_a_resolve_that_is_stopped_keeps_what_is_done(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:

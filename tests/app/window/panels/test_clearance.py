@@ -142,6 +142,7 @@ def test_a_press_shows_where_the_pose_comes_nearest(
         assert button.text() == "Least distance above 0.2 %"
 
 
+@pytest.mark.slow
 def test_solid_keeps_the_clearance_and_shows_no_collision_that_is_none(
     qtbot: QtBot, body_window: MainWindow, body: LearnedBody, colliding: FloatArray
 ) -> None:
