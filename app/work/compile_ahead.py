@@ -113,7 +113,7 @@ def is_compiled() -> bool:
     newest = (folder / "kernels.py").stat().st_mtime
     cache_folder = environ.get("NUMBA_CACHE_DIR")
     places = Path(cache_folder).glob("contact_*") if cache_folder else [folder / "__pycache__"]
-    name = f"kernels.look_again-*.py{sys.version_info.major}{sys.version_info.minor}*.nbi"
+    name = f"kernels.test_pairs-*.py{sys.version_info.major}{sys.version_info.minor}*.nbi"
     return any(file.stat().st_mtime >= newest for place in places for file in place.glob(name))
 
 

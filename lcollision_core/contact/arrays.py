@@ -78,7 +78,7 @@ class Exclusions(NamedTuple):
     touching: IntArray
 
 
-class Nearness(NamedTuple):
+class ClearanceRule(NamedTuple):
     """How near two faces may come: see `contact.distance`.
 
     Attributes
@@ -104,7 +104,7 @@ class Nearness(NamedTuple):
     may_touch: npt.NDArray[np.bool_]
 
 
-class UncountedNodes(NamedTuple):
+class SkippableNodes(NamedTuple):
     """Pairs of nodes of a `FaceTree` below which no pair of faces can count.
 
     All pairs of faces below them share a vertex or are excluded by a contact rule, whatever the
@@ -126,7 +126,7 @@ class UncountedNodes(NamedTuple):
     bits: npt.NDArray[np.uint8]
 
 
-class PoseWork(NamedTuple):
+class PoseWorkspace(NamedTuple):
     """The workspace of one pose, kept between poses.
 
     Attributes
@@ -151,7 +151,7 @@ class PoseWork(NamedTuple):
     fraction: npt.NDArray[np.float64]
 
 
-class Found(NamedTuple):
+class PairBuffer(NamedTuple):
     """A buffer for penetrating pairs of one pose, filled from the front, emptied when full.
 
     With a clearance it holds pairs that are too near; their depth is the missing distance.

@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact.arrays import Nearness
-from lcollision_core.contact.exclusions import regions_of, require_room
-from lcollision_core.contact.reach import later_vertices, surface_of, with_pairs
+from lcollision_core.contact.arrays import ClearanceRule
+from lcollision_core.contact.exclusions import regions_of, require_listable
+from lcollision_core.contact.reach import surface_of, vertices_after, with_pairs
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, Topology
 
@@ -63,7 +63,7 @@ def nearness_of(
     touching: TouchingGroups = (),
     *,
     rest_is_known: bool,
-) -> Nearness:
+) -> ClearanceRule:
     """Return the distances that a clearance requires of the faces of a mesh.
 
     Parameters
@@ -81,12 +81,12 @@ def nearness_of(
         rest = (reference - middle) / body_size
         touching_below = _ROUNDING * float(np.abs(used).max()) / body_size
     else:
-        require = partial(require_room, rule="clearance")
+        require = partial(require_listable, rule="clearance")
         distance = JOINED_WITHIN * clearance * body_size
-        near = later_vertices(surface_of(topology, reference), distance, require)
+        near = vertices_after(surface_of(topology, reference), distance, require)
         joined_start, joined = with_pairs(near, topology.edges)
     region, may_touch = _touching_regions(touching, topology.n_faces)
-    return Nearness(
+    return ClearanceRule(
         clearance, topology.faces, rest, touching_below, joined_start, joined, region, may_touch
     )
 

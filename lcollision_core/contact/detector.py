@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact.arrays import (
+    ClearanceRule,
     Exclusions,
     FaceTree,
-    Nearness,
-    UncountedNodes,
+    SkippableNodes,
 )
 from lcollision_core.contact.clearance import (
     NearestPair,
@@ -30,7 +30,7 @@ from lcollision_core.contact.continuous import LinearPath
 from lcollision_core.contact.distance import triangle_distance
 from lcollision_core.contact.exclusions import (
     exclusions_of,
-    require_room,
+    require_listable,
     rules_of,
     with_other_rules,
 )
@@ -43,7 +43,7 @@ from lcollision_core.contact.kernels import (
 )
 from lcollision_core.contact.search import (
     DEPTH_TOLERANCE,
-    NOTHING_KNOWN,
+    NO_TABLES,
     Cells,
     Searcher,
     UncountedTables,
@@ -225,7 +225,7 @@ class CollisionDetector:
         self._uncounted = UncountedTables(self._tree, self._exclusions)
         self._idle: queue.LifoQueue[Searcher] = queue.LifoQueue()
         self._gpu: GpuSearch | None = None
-        self._nearness: Nearness | None = None
+        self._nearness: ClearanceRule | None = None
         self._may_touch: TouchingGroups = ()
         self._path: LinearPath | None = None
 
@@ -264,7 +264,7 @@ class CollisionDetector:
         other._nearness = None if clearance == 0.0 else self._near(clearance, rest_is_known)
         return other
 
-    def _near(self, clearance: float, rest_is_known: bool) -> Nearness:
+    def _near(self, clearance: float, rest_is_known: bool) -> ClearanceRule:
         return nearness_of(
             clearance,
             self.topology,
@@ -422,7 +422,7 @@ class CollisionDetector:
         ShapeError : another shape, or a vertex that is not finite or absurdly far away.
         """
         pose = self._checked(vertices, (self.topology.n_vertices, 3))
-        uncounted = self._uncounted.nodes() if counted_only else NOTHING_KNOWN
+        uncounted = self._uncounted.nodes() if counted_only else NO_TABLES
         vertex_energy = np.zeros(self.topology.n_vertices)
         parts: list[tuple[IntArray, FloatArray, npt.NDArray[np.uint8]]] = []
         with self._searcher() as searcher:
@@ -531,7 +531,7 @@ class CollisionDetector:
         """
         poses = self._checked(vertices, (-1, self.topology.n_vertices, 3))
         vertex_energy = np.zeros(poses.shape[:2])
-        uncounted = self._uncounted.nodes() if counted_only else NOTHING_KNOWN
+        uncounted = self._uncounted.nodes() if counted_only else NO_TABLES
         n_by_rule = self._count(poses, workers, job, uncounted, vertex_energy=vertex_energy)
         n_excluded = n_by_rule[:, 1 : 1 + N_RULES]
         if counted_only:
@@ -661,7 +661,7 @@ class CollisionDetector:
         for dtype in (np.float64, *drawn):
             for n_found in searcher.search(reference.astype(dtype), with_coincident=True):
                 n_touching += n_found
-                require_room(n_touching, "rest exclusion")
+                require_listable(n_touching, "rest exclusion")
                 parts.append(np.sort(self._tree.slot_face[searcher.found.slots[:n_found]], axis=1))
         return np.unique(np.concatenate(parts), axis=0)
 
@@ -683,7 +683,7 @@ class CollisionDetector:
         poses: npt.NDArray[np.floating],
         workers: int | None,
         job: Job,
-        uncounted: UncountedNodes,
+        uncounted: SkippableNodes,
         *,
         cells: Cells | None = None,
         first_only: bool = False,
@@ -735,7 +735,7 @@ class CollisionDetector:
             self._gpu = GpuSearch(self._tree, self._exclusions, self.topology, self.body_size)
         return self._gpu
 
-    def uncounted_nodes(self) -> UncountedNodes:
+    def uncounted_nodes(self) -> SkippableNodes:
         """Return the nodes that a search for pairs that count can skip, as far as known."""
         return self._uncounted.nodes()
 

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.compiled import compiled, compiled_part, inlined
-from lcollision_core.contact.arrays import FaceTree, Found, Nearness
+from lcollision_core.contact.arrays import ClearanceRule, FaceTree, PairBuffer
 from lcollision_core.contact.depth import in_unit_scale
 from lcollision_core.meshes.topology import FloatArray
 
@@ -329,11 +329,11 @@ def _fill_distances(triangles, squared, weights):
 
 @compiled
 def drop_far(
-    tree: FaceTree, vertices: FloatArray, nearness: Nearness, n_found: int, found: Found
+    tree: FaceTree, vertices: FloatArray, nearness: ClearanceRule, n_found: int, found: PairBuffer
 ) -> int:
-    """Drop pairs that a quick test shows to keep the clearance, so that `keep_near` sees few.
+    """Drop pairs that a quick test shows to keep the clearance, so that `keep_too_near` sees few.
 
-    Parameters and the returned number are those of `keep_near`.
+    Parameters and the returned number are those of `keep_too_near`.
     """
     pair = np.empty((2, 3, 3))
     n_kept = 0
@@ -353,13 +353,13 @@ def drop_far(
 
 
 @compiled
-def keep_near(
+def keep_too_near(
     tree: FaceTree,
     vertices: FloatArray,
-    nearness: Nearness,
+    nearness: ClearanceRule,
     tolerance: float,
     n_found: int,
-    found: Found,
+    found: PairBuffer,
     signed: FloatArray,
 ) -> int:
     """Keep only pairs that are too near, and store the distance that they lack as their depth.

@@ -14,13 +14,13 @@ from lcollision_core.contact.kernels import find_rules
 from lcollision_core.contact.reach import (
     Creases,
     Lists,
+    faces_after,
     faces_within,
-    later_faces,
-    later_vertices,
     lists_of,
     no_lists,
     surface_of,
     touching_faces,
+    vertices_after,
 )
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.contact_rules import ContactRules
@@ -70,7 +70,7 @@ def exclusions_of(
     if rules.near_exclusion > 0.0:
         surface, distance = surface_of(topology, reference), rules.near_exclusion * body_size
         creases = _creases(topology, reference, groups) if rules.near_by_limb else None
-        near = later_vertices(surface, distance, partial(require_room, rule=_NEAR), creases)
+        near = vertices_after(surface, distance, partial(require_listable, rule=_NEAR), creases)
     if rules.rest_exclusion is not None:
         distance = rules.rest_exclusion * body_size
         by_rest = _about(topology, reference, touching, distance, _REST)
@@ -168,9 +168,9 @@ def _about(
     """List for each face the later ones near a partner of a touching face near it."""
     if not len(pairs):
         return no_lists(0)
-    require = partial(require_room, rule=rule)
+    require = partial(require_listable, rule=rule)
     surface = surface_of(topology, reference)
-    return later_faces(touching_faces(surface, pairs, distance, require), require)
+    return faces_after(touching_faces(surface, pairs, distance, require), require)
 
 
 def rules_of(
@@ -198,14 +198,14 @@ def near_pairs_estimate(topology: Topology, reference: FloatArray, distance: flo
     """
     some = np.linspace(0, topology.n_faces - 1, min(topology.n_faces, _SAMPLED)).astype(np.int32)
     listed = faces_within(
-        surface_of(topology, reference), some, distance, partial(require_room, rule=_NEAR)
+        surface_of(topology, reference), some, distance, partial(require_listable, rule=_NEAR)
     )
     # A closed surface has about half as many vertices as faces.
     n_near = 0.5 * len(listed.entry) / len(some)
     return 0.5 * topology.n_vertices * min(n_near, topology.n_vertices)
 
 
-def require_room(n_excluded: int, rule: str) -> None:
+def require_listable(n_excluded: int, rule: str) -> None:
     """Raise `ShapeError` if the lists of a rule have more than `MAX_EXCLUDED` pairs."""
     if n_excluded > MAX_EXCLUDED:
         raise ShapeError(

@@ -36,7 +36,7 @@ _gather = device_function(kernels.gather)
 
 
 class GpuWork(NamedTuple):
-    """The workspace of the n poses that are searched at once; see `PoseWork`.
+    """The workspace of the n poses that are searched at once; see `PoseWorkspace`.
 
     Attributes
     ----------
@@ -136,10 +136,10 @@ def find_candidates(tree, last_leaf, node_of_leaf, uncounted, work, candidates, 
     ----------
     last_leaf : (nodes,) int32, the last leaf below each node
     node_of_leaf : (leaves,) int32
-    uncounted : `UncountedNodes`, whose pairs are left out
+    uncounted : `SkippableNodes`, whose pairs are left out
     work : of `place_poses`
-    candidates : (n, room, 2) int32, overwritten by slots, the smaller first
-    n_candidates : (n,) int32, 0 at first; candidates beyond `room` are counted but not listed
+    candidates : (n, capacity, 2) int32, overwritten by slots, the smaller first
+    n_candidates : (n,) int32, 0 at first; candidates beyond `capacity` are counted but not listed
     """
     pose = cuda.blockIdx.y
     if n_candidates[pose] < 0:
@@ -227,7 +227,7 @@ def measure_candidates(
     n_by_rule : (B, `N_KINDS`) int32, added to
     vertex_sums : (B, V, 2) int64, energies in fixed point, added to; (0, 0, 2) for none
     cell_sums : (B, C, 2) int64, the same for cells
-    squared_depths, rules : (n, room), overwritten by those of the candidates, `COINCIDENT` if
+    squared_depths, rules : (n, capacity), overwritten by those of the candidates, `COINCIDENT` if
         they do not penetrate; (0, 0) for none
     """
     pose = cuda.blockIdx.y

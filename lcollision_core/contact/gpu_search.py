@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact.arrays import Exclusions, FaceTree, IntArray, UncountedNodes
+from lcollision_core.contact.arrays import Exclusions, FaceTree, IntArray, SkippableNodes
 from lcollision_core.contact.gpu_kernels import (
     GpuWork,
     find_candidates,
@@ -20,7 +20,7 @@ from lcollision_core.contact.search import (
     DEPTH_TOLERANCE,
     NO_CELLS,
     NO_ENERGY,
-    NOTHING_KNOWN,
+    NO_TABLES,
     Cells,
 )
 from lcollision_core.jobs import UNWATCHED, Job
@@ -44,7 +44,7 @@ MOST_POSES = 4096
 _BYTES_OF_CANDIDATE = 8
 
 _CANDIDATES_OF_THREAD = 8
-"""Candidates that a thread measures, roughly, if a pose fills its room."""
+"""Candidates that a thread measures, roughly, if a pose fills its capacity."""
 
 
 class ListedPairs(NamedTuple):
@@ -55,7 +55,7 @@ class ListedPairs(NamedTuple):
     pose : (P,) int64
     pairs : (P, 2) int32, face indices, the smaller first
     squared_depth : (P,) float64, in normalised length squared
-    rule : (P,) uint8, as in `Found`
+    rule : (P,) uint8, as in `PairBuffer`
     """
 
     pose: npt.NDArray[np.int64]
@@ -90,7 +90,8 @@ class GpuSearch:
 
     Attributes
     ----------
-    room : candidates that a pose has room for at first; poses with more are searched again
+    candidate_capacity : candidates listed for a pose at first; poses with more are searched
+        again
     """
 
     def __init__(
@@ -113,15 +114,15 @@ class GpuSearch:
             cuda.to_device, (source, level_start, by_level, last_leaf, node_of_leaf)
         )
         self._tree, self._exclusions = copied(tree), copied(exclusions)
-        self._uncounted = NOTHING_KNOWN, copied(NOTHING_KNOWN)
+        self._uncounted = NO_TABLES, copied(NO_TABLES)
         self._buffers = Buffers()
-        self.room = max(1024, 2 * len(topology.faces))
+        self.candidate_capacity = max(1024, 2 * len(topology.faces))
 
     @property
     def at_once(self) -> int:
         """The number of poses that can be searched at once."""
         bytes_of_pose = 84 * self._n_vertices + 24 * (len(self._slot_face) + self._n_nodes)
-        most = MOST_BYTES // max(bytes_of_pose, _BYTES_OF_CANDIDATE * self.room)
+        most = MOST_BYTES // max(bytes_of_pose, _BYTES_OF_CANDIDATE * self.candidate_capacity)
         return max(1, min(MOST_POSES, most))
 
     def count(
@@ -134,7 +135,7 @@ class GpuSearch:
         cells: Cells | None = None,
         first_only: bool = False,
         unit: float = 1.0,
-        uncounted: UncountedNodes = NOTHING_KNOWN,
+        uncounted: SkippableNodes = NO_TABLES,
         job: Job = UNWATCHED,
     ) -> list[int]:
         """Count the pairs of (B, V, 3) poses by rule and sum their energy, as `Searcher.count`.
@@ -169,7 +170,7 @@ class GpuSearch:
         return left
 
     def list_pairs(
-        self, poses: npt.NDArray[np.floating], uncounted: UncountedNodes = NOTHING_KNOWN
+        self, poses: npt.NDArray[np.floating], uncounted: SkippableNodes = NO_TABLES
     ) -> ListedPairs:
         """List the pairs of (B, V, 3) poses that penetrate; poses left to the CPU have none."""
         parts: list[ListedPairs] = []
@@ -190,7 +191,7 @@ class GpuSearch:
         n_cells: int = 0,
         first_only: bool = False,
         unit: float = 1.0,
-        uncounted: UncountedNodes = NOTHING_KNOWN,
+        uncounted: SkippableNodes = NO_TABLES,
         listed: list[ListedPairs] | None = None,
     ) -> GpuCounts:
         """Search (n, V, 3) poses, at most `at_once`, which may be on the GPU; see `count`.
@@ -213,22 +214,31 @@ class GpuSearch:
             judging = folds, of_vertices, DEPTH_TOLERANCE, first_only
             sums = n_by_rule, vertex_sums, cell_sums
             left: list[int] = []
-            waiting = [(np.arange(n_poses, dtype=np.int32), self.room)]
+            waiting = [(np.arange(n_poses, dtype=np.int32), self.candidate_capacity)]
             while waiting:
-                numbers, room = waiting.pop()
+                numbers, capacity = waiting.pop()
                 n_found = self._search_some(
-                    on_gpu, numbers, room, unit / self._body_size, uncounted, judging, sums, listed
+                    on_gpu,
+                    numbers,
+                    capacity,
+                    unit / self._body_size,
+                    uncounted,
+                    judging,
+                    sums,
+                    listed,
                 )
                 too_many = n_found > MOST_BYTES // _BYTES_OF_CANDIDATE
                 left += numbers[(n_found < 0) | too_many].tolist()
-                again = (n_found > room) & ~too_many
+                again = (n_found > capacity) & ~too_many
                 if again.any():
-                    numbers, room = numbers[again], int(n_found[again].max())
-                    step = MOST_BYTES // (_BYTES_OF_CANDIDATE * room)
+                    numbers, capacity = numbers[again], int(n_found[again].max())
+                    step = MOST_BYTES // (_BYTES_OF_CANDIDATE * capacity)
                     pieces = range(0, len(numbers), step)
-                    waiting += [(numbers[start : start + step], room) for start in pieces]
+                    waiting += [(numbers[start : start + step], capacity) for start in pieces]
                     # At most a twentieth of such poses are then searched twice.
-                    self.room = max(self.room, int(np.quantile(n_found, 0.95)))
+                    self.candidate_capacity = max(
+                        self.candidate_capacity, int(np.quantile(n_found, 0.95))
+                    )
             energies = (
                 self._in_numbers("vertex energy", vertex_sums),
                 self._in_numbers("cell energy", cell_sums),
@@ -239,9 +249,9 @@ class GpuSearch:
         self,
         poses: DeviceArray,
         numbers: npt.NDArray[np.int32],
-        room: int,
+        capacity: int,
         scale: float,
-        uncounted: UncountedNodes,
+        uncounted: SkippableNodes,
         judging: tuple[Exclusions, DeviceArray, float, bool],
         sums: tuple[DeviceArray, DeviceArray, DeviceArray],
         listed: list[ListedPairs] | None,
@@ -252,7 +262,7 @@ class GpuSearch:
             self._uncounted = uncounted, copied(uncounted)
         work, rows = self._workspace(n_poses), cuda.to_device(numbers)
         n_candidates = self._buffers.zeros("n_candidates", (n_poses,), np.int32)
-        candidates = self._buffers.take("candidates", (n_poses, room, 2), np.int32)
+        candidates = self._buffers.take("candidates", (n_poses, capacity, 2), np.int32)
         place_poses[n_poses, THREADS](
             poses,
             rows,
@@ -273,9 +283,9 @@ class GpuSearch:
             candidates,
             n_candidates,
         )
-        shape = (0, 0) if listed is None else (n_poses, room)
+        shape = (0, 0) if listed is None else (n_poses, capacity)
         depths, rules = cuda.device_array(shape, np.float64), cuda.device_array(shape, np.uint8)
-        measure_candidates[(blocks_for(room // _CANDIDATES_OF_THREAD), n_poses), THREADS](
+        measure_candidates[(blocks_for(capacity // _CANDIDATES_OF_THREAD), n_poses), THREADS](
             rows,
             work,
             self._tree,
@@ -289,8 +299,8 @@ class GpuSearch:
         )
         n_found: npt.NDArray[np.int32] = n_candidates.copy_to_host()
         if listed is not None:
-            every, all_rules = np.arange(room), rules.copy_to_host()
-            is_listed = (every < n_found[:, None]) & (n_found[:, None] <= room)
+            every, all_rules = np.arange(capacity), rules.copy_to_host()
+            is_listed = (every < n_found[:, None]) & (n_found[:, None] <= capacity)
             row, at = np.nonzero(is_listed & (all_rules != COINCIDENT))
             pairs = np.sort(self._slot_face[candidates.copy_to_host()[row, at]], axis=1)
             depth = depths.copy_to_host()[row, at]

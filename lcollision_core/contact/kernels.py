@@ -17,7 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.compiled import compiled, compiled_part, inlined
-from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork, UncountedNodes
+from lcollision_core.contact.arrays import (
+    Exclusions,
+    FaceTree,
+    PairBuffer,
+    PoseWorkspace,
+    SkippableNodes,
+)
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -159,7 +165,7 @@ def fill_depths(triangles: FloatArray, tolerances: FloatArray, depths: FloatArra
 
 
 @compiled_part
-def _place(pose, scale, work):
+def _load_vertices(pose, scale, work):
     """Fill in the vertices of one pose and return True, or False if beyond `MAX_DISTANCE`.
 
     Coordinates are relative to the middle of the pose's bounding box, so that a pose far from the
@@ -190,7 +196,7 @@ def _refit(pose, scale, enlarged, end, tree, work):
     Boxes of faces that are at most `enlarged` apart, in normalised length, overlap. If there is a
     pose `end`, boxes hold the linear path of their faces to it.
     """
-    if not _place(pose, scale, work):
+    if not _load_vertices(pose, scale, work):
         return False
     middle, rounded = work.middle, work.rounded
     boxes, moves = work.boxes, len(end) > 0
@@ -464,7 +470,7 @@ def _search_leaves(
 
 
 @compiled
-def judge(tree: FaceTree, exclusions: Exclusions, found: Found, start: int, stop: int) -> bool:
+def judge(tree: FaceTree, exclusions: Exclusions, found: PairBuffer, start: int, stop: int) -> bool:
     """Fill in the rules of the pairs from `start` to `stop`; return whether any of them counts."""
     some_count = False
     for n in range(start, stop):
@@ -476,7 +482,7 @@ def judge(tree: FaceTree, exclusions: Exclusions, found: Found, start: int, stop
 
 
 @compiled
-def drop_excluded(tree: FaceTree, exclusions: Exclusions, found: Found, n_found: int) -> int:
+def drop_excluded(tree: FaceTree, exclusions: Exclusions, found: PairBuffer, n_found: int) -> int:
     """Drop pairs that do not penetrate and that a rule excludes; return the number left."""
     n_kept = 0
     for n in range(n_found):
@@ -494,15 +500,15 @@ def drop_excluded(tree: FaceTree, exclusions: Exclusions, found: Found, n_found:
 
 
 @compiled
-def look_again(
+def test_pairs(
     pose: FloatArray,
     scale: float,
     tolerance: float,
     tree: FaceTree,
-    work: PoseWork,
+    work: PoseWorkspace,
     slots: npt.NDArray[np.int32],
     with_apart: bool,
-    found: Found,
+    found: PairBuffer,
 ) -> int:
     """Test known pairs in one pose and put those that penetrate into `found`.
 
@@ -517,7 +523,7 @@ def look_again(
     n_found : number of pairs in `found`, without rules; 0 if `search_pose` refuses the pose
     """
     n_found = 0
-    if not _place(pose, scale, work):
+    if not _load_vertices(pose, scale, work):
         return 0
     for n in range(len(slots)):
         for side in range(2):
@@ -538,10 +544,10 @@ def search_pose(
     tolerance: float,
     tree: FaceTree,
     exclusions: Exclusions,
-    uncounted: UncountedNodes,
-    work: PoseWork,
+    uncounted: SkippableNodes,
+    work: PoseWorkspace,
     first_only: bool,
-    found: Found,
+    found: PairBuffer,
     enlarged: float,
     end: FloatArray,
     n_waiting: int,
@@ -559,7 +565,7 @@ def search_pose(
     tree, exclusions, uncounted, work : of one topology; `work` is overwritten. Pairs of faces below
         nodes that are `uncounted` are not found.
     first_only : end the search at the first leaves that have a pair that counts
-    found : `Found` for at least `LEAF_SIZE`² pairs, overwritten
+    found : `PairBuffer` for at least `LEAF_SIZE`² pairs, overwritten
     enlarged : if above 0, also find the pairs that are at most this far apart, and some that are
         farther, with depth 0; then no rules are filled in and `first_only` has no effect
     end : (V, 3) of the pose that `pose` moves to, in its unit, or (0, 3); with it, pairs are found
@@ -637,7 +643,7 @@ def search_pose(
 
 @compiled
 def add_vertex_energy(
-    tree: FaceTree, found: Found, n_found: int, vertex_energy: FloatArray
+    tree: FaceTree, found: PairBuffer, n_found: int, vertex_energy: FloatArray
 ) -> None:
     """Add a sixth of each pair's squared depth to its six vertices: Algorithm 1 of the paper.
 
@@ -656,7 +662,7 @@ def add_vertex_energy(
 
 @compiled
 def remember(
-    found: Found,
+    found: PairBuffer,
     n_found: int,
     remembered: npt.NDArray[np.int32],
     n_remembered: npt.NDArray[np.int64],
@@ -715,10 +721,10 @@ def search_poses(
     tolerance: float,
     tree: FaceTree,
     exclusions: Exclusions,
-    uncounted: UncountedNodes,
-    work: PoseWork,
+    uncounted: SkippableNodes,
+    work: PoseWorkspace,
     first_only: bool,
-    found: Found,
+    found: PairBuffer,
     leaf_size: int,
     remembered: npt.NDArray[np.int32],
     n_remembered: npt.NDArray[np.int64],
@@ -752,7 +758,7 @@ def search_poses(
     for p in range(len(poses)):
         if first_only:
             n_known = min(n_remembered[0], len(remembered))
-            n_found = look_again(
+            n_found = test_pairs(
                 poses[p], scale, tolerance, tree, work, remembered[:n_known], False, found
             )
             if judge(tree, exclusions, found, none, n_found):

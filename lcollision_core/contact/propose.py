@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from lcollision_core.contact.detector import CollisionDetector
-from lcollision_core.contact.exclusions import require_room
+from lcollision_core.contact.exclusions import require_listable
 from lcollision_core.contact.kernels import NEAR
 from lcollision_core.contact.reach import Lists, faces_within, surface_of
 from lcollision_core.jobs import UNWATCHED, Job
@@ -140,7 +140,7 @@ def _patches(
 ) -> tuple[npt.NDArray[np.int32], sparse.csr_matrix]:
     """Cover faces by n patches; return their middle faces, and (F, n) the faces in each."""
     surface = surface_of(detector.topology, detector.reference)
-    require = partial(require_room, rule="touching radius")
+    require = partial(require_listable, rule="touching radius")
 
     def within(some: npt.NDArray[np.int32], share: float) -> Lists:
         return faces_within(surface, some, share * radius * detector.body_size, require)

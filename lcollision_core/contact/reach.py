@@ -52,13 +52,13 @@ class Creases(NamedTuple):
     places : (V, 3) float64, the vertices at rest
     length : (V,) float64
     joints : (J, 3) float64, positions of the joints
-    of_joint : (J,) float64, the length at each
+    joint_length : (J,) float64, the length at each
     """
 
     places: FloatArray
     length: FloatArray
     joints: FloatArray
-    of_joint: FloatArray
+    joint_length: FloatArray
 
 
 class Lists(NamedTuple):
@@ -133,7 +133,7 @@ def faces_within(
     )
 
 
-def later_vertices(
+def vertices_after(
     surface: Surface,
     distance: float,
     require: Callable[[int], None],
@@ -193,7 +193,7 @@ def touching_faces(
     return TouchingFaces(partners, around, near_to)
 
 
-def later_faces(touching: TouchingFaces, require: Callable[[int], None]) -> Lists:
+def faces_after(touching: TouchingFaces, require: Callable[[int], None]) -> Lists:
     """List for each of F faces the later ones near a face that touches a face near it.
 
     Parameters
@@ -320,7 +320,7 @@ def _may_fold(creases: Creases, a: int, b: int) -> bool:
     if apart <= min(creases.length[a], creases.length[b]) ** 2:
         return True
     for joint in range(len(joints)):
-        if apart <= creases.of_joint[joint] ** 2:
+        if apart <= creases.joint_length[joint] ** 2:
             away = 0.0
             for c in range(3):
                 away += (0.5 * (places[a, c] + places[b, c]) - joints[joint, c]) ** 2

@@ -17,15 +17,15 @@ from scipy import sparse
 
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.contact.arrays import (
+    ClearanceRule,
     Exclusions,
     FaceTree,
-    Found,
     IntArray,
-    Nearness,
-    PoseWork,
-    UncountedNodes,
+    PairBuffer,
+    PoseWorkspace,
+    SkippableNodes,
 )
-from lcollision_core.contact.distance import drop_far, keep_near
+from lcollision_core.contact.distance import drop_far, keep_too_near
 from lcollision_core.contact.kernels import (
     LEAF_SIZE,
     MAX_DISTANCE,
@@ -35,10 +35,10 @@ from lcollision_core.contact.kernels import (
     add_vertex_energy,
     drop_excluded,
     judge,
-    look_again,
     remember,
     search_pose,
     search_poses,
+    test_pairs,
 )
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, Topology
@@ -128,13 +128,13 @@ def _split_faces(
         nodes = np.concatenate([left[nodes], right[nodes]])
 
 
-def allocate_work(tree: FaceTree, n_vertices: int) -> PoseWork:
+def allocate_work(tree: FaceTree, n_vertices: int) -> PoseWorkspace:
     """Allocate the arrays that one thread needs to search poses with a tree."""
     n_slots = len(tree.slot_face)
     n_nodes = len(tree.left)
     # A pair of nodes is replaced by at most three, one level further down on one side or both.
     levels = int(np.ceil(np.log2(n_slots // LEAF_SIZE))) + 1
-    return PoseWork(
+    return PoseWorkspace(
         middle=np.empty(3),
         vertices=np.empty((n_vertices, 3)),
         rounded=np.empty((n_vertices, 3), dtype=np.float32),
@@ -154,7 +154,7 @@ MOST_LISTED = 1 << 26
 
 _LEAVES_AT_ONCE = 64
 
-NOTHING_KNOWN = UncountedNodes(
+NO_TABLES = SkippableNodes(
     level=np.empty(0, dtype=np.int32),
     number=np.empty(0, dtype=np.int32),
     start=np.empty(0, dtype=np.int64),
@@ -173,12 +173,12 @@ class UncountedTables:
 
     def __init__(self, tree: FaceTree, exclusions: Exclusions) -> None:
         self._tree, self._exclusions = tree, exclusions
-        self._made = NOTHING_KNOWN
+        self._made = NO_TABLES
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
 
-    def nodes(self, *, wait: bool = False) -> UncountedNodes:
-        """Return the tables; `NOTHING_KNOWN` until they are made, or if they are not worthwhile.
+    def nodes(self, *, wait: bool = False) -> SkippableNodes:
+        """Return the tables; `NO_TABLES` until they are made, or if they are not worthwhile.
 
         Parameters
         ----------
@@ -209,14 +209,14 @@ class UncountedTables:
 
 
 def make_uncounted(
-    tree: FaceTree, exclusions: Exclusions, goes_on: Callable[[], bool] = lambda: True
-) -> UncountedNodes | None:
+    tree: FaceTree, exclusions: Exclusions, keep_going: Callable[[], bool] = lambda: True
+) -> SkippableNodes | None:
     """Make the tables of a tree.
 
     Parameters
     ----------
     tree, exclusions : of one topology
-    goes_on : polled now and then; if it returns False, None is returned
+    keep_going : polled now and then; if it returns False, None is returned
     """
     depth = np.zeros(len(tree.left), dtype=np.int32)
     _fill_depths(tree.left, tree.right, depth)
@@ -230,12 +230,12 @@ def make_uncounted(
     stride = -(-size // 8)
     start = np.cumsum(size * stride) - size * stride
     bits = np.zeros(size @ stride, dtype=np.uint8)
-    tables = UncountedNodes(level, number, start, stride, bits)
+    tables = SkippableNodes(level, number, start, stride, bits)
     near = _both_ways(exclusions.near_start, exclusions.near)
     rest = _both_ways(exclusions.start, exclusions.face)
     touching = _both_ways(exclusions.touching_start, exclusions.touching)
     for first in range(0, int(size[leaves]), _LEAVES_AT_ONCE):
-        if not goes_on():
+        if not keep_going():
             return None
         stop = min(first + _LEAVES_AT_ONCE, int(size[leaves]))
         _fill_leaves(tree, LEAF_SIZE, exclusions, near, rest, touching, first, stop, tables)
@@ -244,7 +244,7 @@ def make_uncounted(
     return tables
 
 
-class _BothWays(NamedTuple):
+class _SymmetricLists(NamedTuple):
     """Lists of the later partners of each item, and of the earlier ones."""
 
     start: npt.NDArray[np.int64]
@@ -253,11 +253,13 @@ class _BothWays(NamedTuple):
     entry_before: IntArray
 
 
-def _both_ways(start: npt.NDArray[np.int64], entry: IntArray) -> _BothWays:
+def _both_ways(start: npt.NDArray[np.int64], entry: IntArray) -> _SymmetricLists:
     n = len(start) - 1
     after = sparse.csr_matrix((np.ones(len(entry), dtype=np.bool_), entry, start), shape=(n, n))
     before = after.T.tocsr()
-    return _BothWays(start, entry, before.indptr.astype(np.int64), before.indices.astype(np.int32))
+    return _SymmetricLists(
+        start, entry, before.indptr.astype(np.int64), before.indices.astype(np.int32)
+    )
 
 
 @compiled
@@ -281,7 +283,9 @@ def _mark(
 
 
 @compiled_part
-def _mark_both_ways(lists: _BothWays, of: int, mask: npt.NDArray[np.uint8], bit: np.uint8) -> None:
+def _mark_both_ways(
+    lists: _SymmetricLists, of: int, mask: npt.NDArray[np.uint8], bit: np.uint8
+) -> None:
     if len(lists.start) > 1:
         _mark(lists.start, lists.entry, of, mask, bit)
         _mark(lists.start_before, lists.entry_before, of, mask, bit)
@@ -292,12 +296,12 @@ def _fill_leaves(
     tree: FaceTree,
     leaf_size: int,
     exclusions: Exclusions,
-    near: _BothWays,
-    rest: _BothWays,
-    touching: _BothWays,
+    near: _SymmetricLists,
+    rest: _SymmetricLists,
+    touching: _SymmetricLists,
     first: int,
     stop: int,
-    made: UncountedNodes,
+    made: SkippableNodes,
 ) -> None:
     """Fill in the table of the leaves, for pairs of leaves `first` to `stop` with later leaves.
 
@@ -360,7 +364,7 @@ def _fill_leaves(
 
 
 @compiled_part
-def _has(made: UncountedNodes, a: int, b: int) -> bool:
+def _has(made: SkippableNodes, a: int, b: int) -> bool:
     """Whether two nodes share a table whose bit of them is set."""
     level = made.level[a]
     if level != made.level[b]:
@@ -371,7 +375,7 @@ def _has(made: UncountedNodes, a: int, b: int) -> bool:
 
 
 @compiled_part
-def _are_uncounted(tree: FaceTree, made: UncountedNodes, a: int, b: int) -> bool:
+def _are_uncounted(tree: FaceTree, made: SkippableNodes, a: int, b: int) -> bool:
     """Whether no pair below two nodes of one depth counts, by the tables of the levels below.
 
     Depths of leaves differ by at most one, so an inner node at a leaf's depth has two leaves.
@@ -384,7 +388,7 @@ def _are_uncounted(tree: FaceTree, made: UncountedNodes, a: int, b: int) -> bool
 
 
 @compiled
-def _fill_inner(tree: FaceTree, nodes: IntArray, made: UncountedNodes) -> None:
+def _fill_inner(tree: FaceTree, nodes: IntArray, made: SkippableNodes) -> None:
     """Fill in the table of the inner nodes of one depth from those of their children."""
     table, stride = made.start[made.level[nodes[0]]], made.stride[made.level[nodes[0]]]
     for i in range(len(nodes)):
@@ -497,14 +501,14 @@ class Searcher:
         self._exclusions = exclusions
         self._body_size = body_size
         self._scale = 1.0 / body_size
-        self._work: PoseWork = allocate_work(tree, topology.n_vertices)
+        self._work: PoseWorkspace = allocate_work(tree, topology.n_vertices)
         self._poses = np.empty((1, topology.n_vertices, 3))
         self._unused = topology.unused_vertices
         self._faces, self._used = topology.faces, topology.faces[0, 0]
         self._waiting = 0
         self._remembered = np.empty((_REMEMBERED, 2), dtype=np.int32)
         self._n_remembered = np.zeros(1, dtype=np.int64)
-        self.found = Found(
+        self.found = PairBuffer(
             slots=np.empty((_PAIRS_AT_ONCE, 2), dtype=np.int32),
             squared_depth=np.empty(_PAIRS_AT_ONCE),
             rule=np.empty(_PAIRS_AT_ONCE, dtype=np.uint8),
@@ -519,8 +523,8 @@ class Searcher:
         number: int | None = None,
         unit: float = 1.0,
         with_coincident: bool = False,
-        uncounted: UncountedNodes = NOTHING_KNOWN,
-        nearness: Nearness | None = None,
+        uncounted: SkippableNodes = NO_TABLES,
+        nearness: ClearanceRule | None = None,
         exclusions: Exclusions | None = None,
         end: npt.NDArray[np.floating] | None = None,
     ) -> Iterator[int]:
@@ -546,7 +550,7 @@ class Searcher:
         if end is not None or with_coincident:
             enlarged = max(enlarged, DEPTH_TOLERANCE)
         if first_only:
-            n_found = look_again(
+            n_found = test_pairs(
                 self._poses[0],
                 self._scale,
                 DEPTH_TOLERANCE,
@@ -603,8 +607,8 @@ class Searcher:
         cell_energy: FloatArray = NO_ENERGY,
         first_only: bool = False,
         unit: float = 1.0,
-        uncounted: UncountedNodes = NOTHING_KNOWN,
-        nearness: Nearness | None = None,
+        uncounted: SkippableNodes = NO_TABLES,
+        nearness: ClearanceRule | None = None,
     ) -> None:
         """Count the pairs of (B, V, 3) poses by rule, and sum their energy: see `search_poses`.
 
@@ -661,7 +665,7 @@ class Searcher:
         self,
         n_found: int,
         exclusions: Exclusions,
-        nearness: Nearness | None,
+        nearness: ClearanceRule | None,
         with_coincident: bool = False,
     ) -> tuple[int, bool]:
         """Keep pairs that are too near, or coincide, and judge them.
@@ -672,7 +676,7 @@ class Searcher:
         if nearness is not None:
             n_found = drop_far(tree, vertices, nearness, n_found, candidates)
             n_found = drop_excluded(tree, exclusions, candidates, n_found)
-            n_found = keep_near(
+            n_found = keep_too_near(
                 tree, vertices, nearness, DEPTH_TOLERANCE, n_found, candidates, self.signed
             )
         elif with_coincident:

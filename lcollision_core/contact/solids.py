@@ -65,7 +65,7 @@ class Layer:
     kind: str
 
 
-def layers_of(
+def split_layers(
     vertices: FloatArray,
     faces: npt.NDArray[np.integer],
     wall: float,
@@ -117,7 +117,7 @@ def layers_of(
     return layers
 
 
-def solid_of(
+def join_layers(
     layers: Sequence[Layer], height: float, wall: float, where: Where, job: Job
 ) -> tuple[Manifold, float]:
     """Join closed layers to a solid and fill its cavities.

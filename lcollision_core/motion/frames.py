@@ -54,7 +54,7 @@ class Frames:
     job : polled for each frame
     continuous : whether poses between frames are also tested with interpolated vertices, not only
         with interpolated codes
-    spare : >= 0, normalised, added to the clearance of poses between frames
+    extra_clearance : >= 0, normalised, added to the clearance of poses between frames
     largest_change : of a vertex of a resolved frame, normalised; None for no limit
     kept_contacts : contacts to keep, or None
     """
@@ -65,7 +65,7 @@ class Frames:
     pool: Executor
     job: Job = UNWATCHED
     continuous: bool = False
-    spare: float = 0.0
+    extra_clearance: float = 0.0
     largest_change: float | None = None
     kept_contacts: KeptContacts | None = None
 
@@ -75,7 +75,7 @@ class Frames:
 
     @cached_property
     def _check_between(self) -> ExactCheck:
-        return self.resolver.check.with_clearance(self.options.clearance + self.spare)
+        return self.resolver.check.with_clearance(self.options.clearance + self.extra_clearance)
 
     def check(self, frame: int) -> ExactCheck:
         """Return the exact check of one frame, with the clearance of the options."""
@@ -673,13 +673,13 @@ class Guard:
     frames : of the motion, two turns of a cycle
     n : number of frames, of one turn
     was_free : (n,) bool
-    was_clear : (n,) bool, whether a frame and the next were free, and all poses between
+    was_clear_between : (n,) bool, whether a frame and the next were free, and all poses between
     """
 
     frames: Frames
     n: int
     was_free: npt.NDArray[np.bool_]
-    was_clear: npt.NDArray[np.bool_]
+    was_clear_between: npt.NDArray[np.bool_]
 
     def faults(
         self,
@@ -708,7 +708,7 @@ class Guard:
         frames_to_check = [
             at
             for at in pairs
-            if at < last and self.was_clear[at] and free[at] and free[(at + 1) % self.n]
+            if at < last and self.was_clear_between[at] and free[at] and free[(at + 1) % self.n]
         ]
 
         def collides(at: int) -> bool:

@@ -37,7 +37,7 @@ _SOFT_ROUNDS = 6
 """Most rounds of smoothing corrections that remove overlap, each without the frames that became
 worse."""
 
-_SPARE, _MOST_BETWEEN = (0.0, 0.0, 0.002, 0.004, 0.008), 7
+_EXTRA_CLEARANCES, _MOST_BETWEEN = (0.0, 0.0, 0.002, 0.004, 0.008), 7
 """Normalised distance added between parts in poses between frames, for each round of solving spans
 that touch there, and the most such poses per frame."""
 
@@ -311,8 +311,8 @@ class _Resolution:
         again = np.arange(len(motion)) % n
         pairs = _free_pairs(before[:n], again, within)
         hit = frames.collide_between(pairs, _fractions(options.substeps))
-        was_clear = np.zeros(n, dtype=np.bool_)
-        was_clear[pairs[~hit]] = True
+        was_clear_between = np.zeros(n, dtype=np.bool_)
+        was_clear_between[pairs[~hit]] = True
         if options.continuous:
             hit |= frames.touch_between(pairs, motion.codes)
         pairs, colliding = pairs[hit], ~before[:n]
@@ -334,7 +334,7 @@ class _Resolution:
             before,
             colliding,
             apart,
-            Guard(frames, n, before[:n], was_clear),
+            Guard(frames, n, before[:n], was_clear_between),
             standing,
             np.full(n, options.substeps),
         )
@@ -349,15 +349,15 @@ class _Resolution:
         n_rounds = 0
         self.job.report(0, sum(map(len, todo)))
         while todo:
-            self._solve_all(todo, _SPARE[n_rounds])
+            self._solve_all(todo, _EXTRA_CLEARANCES[n_rounds])
             self.done = {}
-            todo = self._bar_faults(todo)
+            todo = self._exclude_faults(todo)
             if todo or self.unfinished or not self.options.continuous:
                 continue
             pairs = _free_pairs(self.after, again, self.within)
             pairs = pairs[self.is_changed[pairs] | self.is_changed[again[pairs + 1]]]
             touching = pairs[self.guard.frames.touch_between(pairs, self.codes[again])]
-            if not len(touching) or n_rounds == len(_SPARE) - 1:
+            if not len(touching) or n_rounds == len(_EXTRA_CLEARANCES) - 1:
                 break
             n_rounds += 1
             more = np.minimum(2 * self.substeps[touching] + 1, _MOST_BETWEEN)
@@ -421,10 +421,10 @@ class _Resolution:
         self.codes[own], self.after[own] = self.motion.codes[own], self.before[own]
         self.is_changed[own] = False
 
-    def _solve_all(self, spans: Sequence[range], spare: float) -> None:
+    def _solve_all(self, spans: Sequence[range], extra_clearance: float) -> None:
         """Solve spans in parallel; keep the finished part of a span that is stopped."""
         self.n_frames += sum(map(len, spans))
-        frames = replace(self.frames, spare=spare)
+        frames = replace(self.frames, extra_clearance=extra_clearance)
         tasks = [(span, self.outer.submit(self._solve, frames, span)) for span in spans]
         for span, task in tasks:
             try:
@@ -480,15 +480,15 @@ class _Resolution:
             known = [self.done[at] for at in self._own(window).tolist() if at in self.done]
             is_new = len(known) < len(window)
             # Frames that the next window corrects again count once.
-            credit = _Credit(self, window.stop - reached)
+            progress = _ProgressShare(self, window.stop - reached)
             if is_new:
-                known = self._solve_window(frames, window, span, credit.tell)
+                known = self._solve_window(frames, window, span, progress.report)
             for at, solved in zip(self._own(window).tolist(), known, strict=True):
                 self.codes[at], self.after[at] = solved
                 if self.keep is not None and is_new:
                     with self.lock:
                         self.keep(at, solved)
-            credit.tell(1.0)
+            progress.report(1.0)
             reached = window.stop
             self.solved[span] = reached - span.start
 
@@ -538,7 +538,7 @@ class _Resolution:
         self.barred[frames] = True
         self.reasons |= dict.fromkeys(frames.tolist(), reason)
 
-    def _bar_faults(self, spans: Sequence[range]) -> list[range]:
+    def _exclude_faults(self, spans: Sequence[range]) -> list[range]:
         """Put back spans that are worse than the original, and bar the frames that made them so.
 
         Returns
@@ -556,7 +556,7 @@ class _Resolution:
             self._put_back(span)
             is_open[own] = True
             places = {at: number for number, at in enumerate(own.tolist())}
-            if self._let_go(span, [places.get(at, 0) for at in faults]):
+            if self._drop_contacts(span, [places.get(at, 0) for at in faults]):
                 continue
             inside = runs((self.colliding & ~self.barred)[own])
             for at, reason in faults.items():
@@ -566,7 +566,7 @@ class _Resolution:
                 self._bar(own[nearest.start : nearest.stop], reason)
         return [span for span in self._spans() if is_open[self._own(span)].any()]
 
-    def _let_go(self, span: range, faults: Sequence[int]) -> bool:
+    def _drop_contacts(self, span: range, faults: Sequence[int]) -> bool:
         """Drop the kept contacts near faults of a span; return whether there were any.
 
         Parameters
@@ -660,13 +660,13 @@ class _Resolution:
         return tuple(sorted(filter(None, spans), key=lambda one: one.frames))
 
 
-class _Credit:
+class _ProgressShare:
     """Progress of some frames, as part of a resolution."""
 
     def __init__(self, run: _Resolution, n_frames: int) -> None:
         self._run, self._n_frames, self._told = run, n_frames, 0.0
 
-    def tell(self, share: float) -> None:
+    def report(self, share: float) -> None:
         """Report the share of the frames that is done, in [0, 1]; it never falls."""
         run = self._run
         with run.lock:

@@ -162,7 +162,7 @@ def least_corrections(
         known = np.column_stack([bounds[equal], gram[equal, rest]])
         solved = cho_solve(cho_factor(gram[equal, equal]), known)
     mixed = gram[rest, equal]
-    multipliers = _pressed(
+    multipliers = _solve_lcp(
         gram[rest, rest] - mixed @ solved[:, 1:], bounds[rest] - mixed @ solved[:, 0]
     )
     if multipliers is None:
@@ -172,7 +172,7 @@ def least_corrections(
     return moved
 
 
-def _pressed(gram: FloatArray, bounds: FloatArray) -> FloatArray | None:
+def _solve_lcp(gram: FloatArray, bounds: FloatArray) -> FloatArray | None:
     """Return the multipliers >= 0 of (M,) half-spaces, None if the solver fails.
 
     Parameters
@@ -266,7 +266,7 @@ _BEYOND, _BOUNDED, _BOUND_ROUNDS = 0.01, 60, 3
 farthest first, and the most rounds."""
 
 
-class _Looked(NamedTuple):
+class _Evaluation(NamedTuple):
     """Corrections of the frames of a span, and their collisions.
 
     Attributes
@@ -343,7 +343,7 @@ class SpanProgram:
     def solve(self) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Return the (n, D) corrections, and (n,) whether each frame is free with them."""
         best, gives_way = self._search(), True
-        if best.n_apart and self._let_go(best):
+        if best.n_apart and self._drop_contacts(best):
             # Search again without the touches that stay apart.
             best = self._search()
         for _ in range(1, _SEARCHES):
@@ -362,7 +362,7 @@ class SpanProgram:
         chosen = np.where(put_back[:, None], self._known - self._targets, best.corrections)
         return chosen, best.is_free | put_back
 
-    def _let_go(self, best: _Looked) -> bool:
+    def _drop_contacts(self, best: _Evaluation) -> bool:
         """Leave out touches that stay apart; return whether there are any."""
         contacts = self.frames.kept_contacts
         if contacts is None:
@@ -375,7 +375,7 @@ class SpanProgram:
         self.frames = replace(self.frames, kept_contacts=contacts.without_touches(apart))
         return bool(apart)
 
-    def _forget(self, best: _Looked) -> None:
+    def _forget(self, best: _Evaluation) -> None:
         """Forget a search but for its result: contacts met elsewhere lead to detours."""
         for seen in (*self._contacts, *self._between.values()):
             seen.clear()
@@ -384,10 +384,10 @@ class SpanProgram:
         self._known = np.where(best.is_free[:, None], ends, self._known)
         self._is_known |= best.is_free
 
-    def _search(self) -> _Looked:
+    def _search(self) -> _Evaluation:
         """Return the first corrections that free all frames, else the best of all rounds."""
         n = len(self._targets)
-        start = self._look(np.zeros(self._targets.shape), {}, resolves=False)
+        start = self._evaluate(np.zeros(self._targets.shape), {}, resolves=False)
         if start.score == 0.0 and not start.n_apart:
             return start
         pinned: dict[int, FloatArray] = {}
@@ -408,7 +408,7 @@ class SpanProgram:
             # Apply pinned corrections even if the solver failed.
             for at, correction in pinned.items():
                 corrections[at] = correction
-            now = self._look(corrections, pinned, number + 1 in _RESOLVED_AT)
+            now = self._evaluate(corrections, pinned, number + 1 in _RESOLVED_AT)
             self._rounds += 1
             self.tell(1.0 - _LEFT_BY_ROUND**self._rounds)
             if number + 1 in _RESOLVED_AT:
@@ -424,7 +424,7 @@ class SpanProgram:
                 best = now
         return best
 
-    def _is_settled(self, now: _Looked) -> bool:
+    def _is_settled(self, now: _Evaluation) -> bool:
         """Whether all is free except frames for which no free pose was found."""
         return self._are_hopeless(~now.is_free) and not now.between
 
@@ -432,7 +432,7 @@ class SpanProgram:
         """Whether no free pose was found for any of some frames, (n,), nor is still sought."""
         return set(np.flatnonzero(stuck)) <= self._hopeless - set(np.flatnonzero(self._is_known))
 
-    def _stuck(self, now: _Looked, reach: float | None) -> list[int]:
+    def _stuck(self, now: _Evaluation, reach: float | None) -> list[int]:
         """Return the colliding frames that have a known free pose within a reach.
 
         A neighbour's correction may give a frame a nearer free pose.
@@ -467,9 +467,9 @@ class SpanProgram:
             n, self.smoothness, self.before, self.after, pinned, size, self.is_cycle
         )
 
-    def _look(
+    def _evaluate(
         self, corrections: FloatArray, pinned: dict[int, FloatArray], resolves: bool
-    ) -> _Looked:
+    ) -> _Evaluation:
         """Collect the contacts of corrections."""
         poses = self._targets + corrections
         n = len(poses)
@@ -507,7 +507,7 @@ class SpanProgram:
                 self._between.setdefault(place, []).append(contacts)
         n_apart = sum(pulls.n_apart for pulls in self._pulls.values())
         lack = sum(pulls.lack for pulls in self._pulls.values())
-        return _Looked(corrections, is_free, between, n_apart, lack)
+        return _Evaluation(corrections, is_free, between, n_apart, lack)
 
     def _reached(self, at: int, goal: FloatArray, resolves: bool) -> bool:
         """Collect the contacts of one frame on its way to a pose; return whether that is free."""

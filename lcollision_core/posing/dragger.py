@@ -210,7 +210,7 @@ STANDING_WEIGHT = 10.0
 """Weight of the squared drift of a point standing on the ground, likewise."""
 
 
-class Held(NamedTuple):
+class HeldPatch(NamedTuple):
     """A patch that stays.
 
     Attributes
@@ -277,7 +277,9 @@ class PatchGoal:
 
     reach, longest_step, price = 0.012, 0.01, 1.0
 
-    def __init__(self, space: PoseSpace, grip: Grip, pins: Sequence[Held], strength: float) -> None:
+    def __init__(
+        self, space: PoseSpace, grip: Grip, pins: Sequence[HeldPatch], strength: float
+    ) -> None:
         self._space, self._pins, self.grip, self._strength = space, pins, grip, strength
         self._means = _mean_slopes(space, [grip, *(pin.grip for pin in pins)])
         self._weights = np.repeat([1.0, *(pin.weight for pin in pins)], 3)
@@ -311,14 +313,14 @@ class TwistGoal:
         self,
         space: PoseSpace,
         domain: int,
-        pins: Sequence[Held],
+        pins: Sequence[HeldPatch],
         strength: float,
         decoded: FloatArray,
     ) -> None:
         inside = np.flatnonzero(space.vertex_domain == domain)
         self._part = Grip(int(inside[0]), 0.0, inside, np.full(len(inside), 1.0 / len(inside)))
         self._space, self._strength = space, strength
-        self._pins = [Held(self._part, self._part.position(decoded)), *pins]
+        self._pins = [HeldPatch(self._part, self._part.position(decoded)), *pins]
         self._means = _mean_slopes(space, [pin.grip for pin in self._pins])
         self._weights = np.append(np.repeat([pin.weight for pin in self._pins], 3), 1.0)
         self._arms = self._arms_of(decoded)
@@ -388,7 +390,7 @@ def _mean_slopes(space: PoseSpace, patches: Sequence[Grip]) -> MeanSlopes:
     return space.mean_slopes(csr_matrix((weights, vertices, ends), shape=shape))
 
 
-def _drifts(pins: Sequence[Held], pose: Decoded) -> list[FloatArray]:
+def _drifts(pins: Sequence[HeldPatch], pose: Decoded) -> list[FloatArray]:
     return [
         _shortened(pin.place - pin.grip.position(pose.vertices), PatchGoal.reach) for pin in pins
     ]
@@ -588,7 +590,7 @@ class PoseDragger:
         if self._options.solid:
             self._found = check.find(check.exported(self._here.vertices))
             self._allowed = ContactRegions.of(space, self._found).by_name()
-        self._stands: list[Held] = []
+        self._stands: list[HeldPatch] = []
         self._goal = CodesGoal(space) if grip is None else self._take(grip, pins)
         self._stretch = self._stretch_of(self._here.vertices)
         return self._result(0.0, settled=True)
@@ -608,7 +610,7 @@ class PoseDragger:
             )
         held_joints = limbs.holding(inside, weights)
         stays = [
-            Held(grip, np.array(place) / self._check.body_size)
+            HeldPatch(grip, np.array(place) / self._check.body_size)
             for pin in pins
             for vertex, radius, place in pin.patches
             for grip in (make_grip(space, vertex, radius),)
@@ -616,7 +618,7 @@ class PoseDragger:
         if options.standing and self._up is not None:
             stands = limbs.standing(here, self._up, held_joints).values()
             self._stands = [
-                Held(Grip.at(vertex), here[vertex], STANDING_WEIGHT)
+                HeldPatch(Grip.at(vertex), here[vertex], STANDING_WEIGHT)
                 for vertex in np.concatenate([*stands, []]).astype(int).tolist()
             ]
         pinned = [limbs.holding(stay.grip.vertices, stay.grip.weights) for stay in stays]
@@ -637,7 +639,7 @@ class PoseDragger:
             moving = limbs.with_pinned(moving | reach, pinned)
             self._reaches.append(moving)
         self._held = limbs.with_pinned(limbs.limb(held_joints, least), pinned)
-        self._let_move()
+        self._extend_reach()
         # Parts that cannot move need no hold.
         self._stands = [
             stand
@@ -649,7 +651,7 @@ class PoseDragger:
             return PatchGoal(space, grip, stays, options.strength)
         return TwistGoal(space, grip.domain, stays, options.strength, here)
 
-    def _let_move(self) -> None:
+    def _extend_reach(self) -> None:
         """Let the codes of the next reach move."""
         self._n_short = 0
         moving = self._space.limbs.codes_of(self._reaches.pop(0))
@@ -701,7 +703,7 @@ class PoseDragger:
             self._n_short += 1
             settled = False
             if self._n_short == PATIENCE:
-                self._let_move()
+                self._extend_reach()
         else:
             self._n_short = 0
         if gain >= _SHORT * goal.reach:
@@ -739,7 +741,7 @@ class PoseDragger:
             is_free = low < high
             low = np.where(is_free, np.minimum(low, aim), low)
             high = np.where(is_free, np.maximum(high, aim), high)
-            if self._may_land(goal, aim, low, high) and self._goes(aim):
+            if self._may_land(goal, aim, low, high) and self._try_move(aim):
                 return True
             stays = (aim == self._start) & (here == self._start)
             low, high = np.where(stays, here, low), np.where(stays, here, high)
@@ -763,11 +765,11 @@ class PoseDragger:
             if length < _STILL:
                 return False
             way *= min(1.0, self._pace * goal.longest_step / length)
-            if self._goes(here + way):
+            if self._try_move(here + way):
                 return True
             if len(self._contacts.offsets) == n_contacts:
                 break
-        return there is not None and any(self._goes(here + cut * way) for cut in CUTS)
+        return there is not None and any(self._try_move(here + cut * way) for cut in CUTS)
 
     def _may_land(
         self, goal: CodesGoal, aim: FloatArray, low: FloatArray, high: FloatArray
@@ -783,7 +785,7 @@ class PoseDragger:
             and (contacts.normals @ aim <= contacts.offsets).all()
         )
 
-    def _goes(self, there: FloatArray) -> bool:
+    def _try_move(self, there: FloatArray) -> bool:
         """Move to codes if their pose is allowed; else remember the contacts in the way."""
         check = self._check
         decoded = check.decode(there)[0]
@@ -806,7 +808,7 @@ class PoseDragger:
                 for name, (depth, squared) in depths.items()
             }
             if not collisions.colliding:
-                self._contacts.drop_refuted(there)
+                self._contacts.drop_violated(there)
         self._here, self._stretch = Decoded(there, decoded), stretch
         self._blocking = self._blocking[:0]
         return True

@@ -182,7 +182,7 @@ class ExactCheck:
         return 1.0 if self.placement is None else 1.0 / self.placement.scale
 
 
-def lack_slopes(triangles_a: FloatArray, triangles_b: FloatArray) -> FloatArray:
+def clearance_slopes(triangles_a: FloatArray, triangles_b: FloatArray) -> FloatArray:
     """Differentiate the distance that pairs of triangles lack of a clearance by their corners.
 
     Parameters
@@ -206,7 +206,7 @@ def add_slopes(
     decoded: FloatArray,
     weights: FloatArray,
     *,
-    may_be_apart: bool,
+    has_clearance: bool,
 ) -> None:
     """Add the slopes of colliding pairs to rows of derivatives by a pose's vertices.
 
@@ -217,11 +217,11 @@ def add_slopes(
     faces : (P, 2, 3) vertices of each pair
     decoded : (V, 3) float64 array, normalised
     weights : (P,) factors of the slopes
-    may_be_apart : whether pairs were found with a clearance, so that slopes are those of the
+    has_clearance : whether pairs were found with a clearance, so that slopes are those of the
         distances that they lack
     """
     triangles = decoded[faces[:, 0]], decoded[faces[:, 1]]
-    slopes = lack_slopes(*triangles) if may_be_apart else depth_slopes(*triangles)[1]
+    slopes = clearance_slopes(*triangles) if has_clearance else depth_slopes(*triangles)[1]
     places = row_of_pair[:, None], faces.reshape(len(faces), 6)
     np.add.at(by_vertices, places, slopes * weights[:, None, None])
 
@@ -280,7 +280,7 @@ def contact_slopes(
     found: SelfCollisions,
     regions: ContactRegions,
     *,
-    may_be_apart: bool = False,
+    has_clearance: bool = False,
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
     """Differentiate the depths of a colliding pose's contacts by its codes.
 
@@ -293,7 +293,7 @@ def contact_slopes(
     decoded : (V, 3) float64 array, the pose's vertices in normalised length
     found : the pose's colliding pairs, at least one
     regions : of `found`
-    may_be_apart : whether pairs were found with a clearance, so that some do not penetrate
+    has_clearance : whether pairs were found with a clearance, so that some do not penetrate
 
     Returns
     -------
@@ -308,7 +308,7 @@ def contact_slopes(
     deepest = np.argsort(-regions.depth, kind="stable")[:MAX_REGIONS]
     by_vertices = np.zeros((len(regions.names), *decoded.shape))
     faces = space.topology.faces[found.pairs]
-    add_slopes(by_vertices, regions.of_pair, faces, decoded, share, may_be_apart=may_be_apart)
+    add_slopes(by_vertices, regions.of_pair, faces, decoded, share, has_clearance=has_clearance)
     return deepest, space.pull_back(codes, by_vertices[deepest])
 
 
@@ -358,7 +358,7 @@ class Contacts:
         """
         apart = self._check.clearance > 0.0
         deepest, slopes = contact_slopes(
-            self._check.space, codes, decoded, found, regions, may_be_apart=apart
+            self._check.space, codes, decoded, found, regions, has_clearance=apart
         )
         tolerated = np.full(len(regions.names), np.inf)
         np.minimum.at(
@@ -381,7 +381,7 @@ class Contacts:
         """Return the vertices of the contacts that (D,) codes have reached."""
         return self.vertices[self.normals @ codes >= self.offsets - CLEARANCE]
 
-    def drop_refuted(self, free: FloatArray) -> None:
+    def drop_violated(self, free: FloatArray) -> None:
         """Drop half-spaces that do not hold a free pose: they were extrapolated too far."""
         self._keep(np.flatnonzero(self.normals @ free <= self.offsets + CLEARANCE))
 

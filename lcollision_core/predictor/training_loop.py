@@ -300,7 +300,7 @@ class TrainingLoop:
             network = self._run(processes)
         if self._patches_path is not None:
             self._patches_path.unlink(missing_ok=True)
-        return self._judged(network)
+        return self._network_to_score(network)
 
     def _run(self, processes: Processes) -> PredictorNetwork:
         config = self.config
@@ -424,7 +424,7 @@ class TrainingLoop:
             talk = step % _STEPS_BETWEEN_TALKS == 0
             stop = talk and processes.any_of(stop)
         if step % self._steps_an_epoch == 0:
-            self._errors = _error_rates(self._judged(network), self._watched)
+            self._errors = _error_rates(self._network_to_score(network), self._watched)
         if processes.rank == 0 and (stop or due):
             self._save(step, network, optimiser, checkpoint)
         if stop:
@@ -451,7 +451,7 @@ class TrainingLoop:
             )
         )
 
-    def _judged(self, network: PredictorNetwork) -> PredictorNetwork:
+    def _network_to_score(self, network: PredictorNetwork) -> PredictorNetwork:
         """Return the network to measure and store, with the mean weights if they are kept."""
         return network if self._average is None else cast(PredictorNetwork, self._average.module)
 

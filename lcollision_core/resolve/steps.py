@@ -134,7 +134,7 @@ def _slide(
         problem.deadline.poll()
         if problem.deadline.expired or not contacts.add(colliding):
             break
-        contacts.drop_refuted(free)
+        contacts.drop_violated(free)
         goal = problem.nearest(problem.target, contacts)
         if goal is None:
             break
@@ -413,7 +413,7 @@ class LeastOverlap:
         farthest = order[np.sort(first)[:_BOUNDED]]
         by_vertices = np.zeros((len(residuals) + len(farthest), *moved.shape))
         faces, apart = space.topology.faces[collisions.pairs], self._check.clearance > 0.0
-        add_slopes(by_vertices, regions.of_pair, faces, here.decoded, weights, may_be_apart=apart)
+        add_slopes(by_vertices, regions.of_pair, faces, here.decoded, weights, has_clearance=apart)
         bounds = np.arange(len(residuals), len(by_vertices))
         by_vertices[bounds, farthest] = moved[farthest] / lengths[farthest, None]
         by_codes = space.pull_back(here.latent, by_vertices)

@@ -89,8 +89,8 @@ def print_pose(
     places = _Places(body, vertices, faces)
     part = job.part(lambda done, total: job.report(50 + 40 * done // total, _STEPS))
     wall = options.wall
-    layers = solids.layers_of(vertices, faces, wall, options.open_layers, places.where)
-    solid, filled = solids.solid_of(layers, options.height, wall, places.where, part)
+    layers = solids.split_layers(vertices, faces, wall, options.open_layers, places.where)
+    solid, filled = solids.join_layers(layers, options.height, wall, places.where, part)
     # Thickened layers reach below the ground.
     places.raised = -solid.bounding_box()[2]
     solid = solid.translate([0.0, 0.0, places.raised])

@@ -44,7 +44,7 @@ def test_a_first_start_compiles_beside_the_window_and_a_second_does_not(
         assert list(kept.glob("contact_*/kernels.search_pose-*.nbi"))
         assert not is_compiled()
     ahead.wait_for_all()
-    assert list(kept.glob("contact_*/distance.keep_near-*.nbi"))
+    assert list(kept.glob("contact_*/distance.keep_too_near-*.nbi"))
     assert is_compiled()
     compiled = {path: path.stat().st_mtime_ns for path in kept.rglob("*.nb?")}
     for wait in (ahead.begin, ahead.wait_for_check, ahead.wait_for_all):
@@ -85,10 +85,10 @@ def test_what_an_older_version_or_another_python_compiled_does_not_count(kept: P
     folder = kept / "contact_1"
     folder.mkdir()
     version = f"py{sys.version_info.major}{sys.version_info.minor}"
-    old = folder / f"kernels.look_again-1.{version}.nbi"
+    old = folder / f"kernels.test_pairs-1.{version}.nbi"
     old.touch()
     os.utime(old, (1e9, 1e9))
-    (folder / "kernels.look_again-2.py27.nbi").touch()
+    (folder / "kernels.test_pairs-2.py27.nbi").touch()
     (folder / f"kernels.search_pose-2.{version}.nbi").touch()
     assert not is_compiled()
     os.utime(old)

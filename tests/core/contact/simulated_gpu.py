@@ -131,10 +131,10 @@ def test_candidates_that_overflow_are_found_again_and_what_is_refused_is_left() 
     search = detector.gpu_search()
     counts = np.zeros((2, 3, 8), dtype=np.int64)
     assert search.count(poses, counts[0]) == []
-    search.room = 2
+    search.candidate_capacity = 2
     assert search.count(poses, counts[1]) == []
     assert np.array_equal(counts[1], counts[0])
-    assert search.room > 2
+    assert search.candidate_capacity > 2
     poses[2, 1, 2] = np.nan
     assert search.count(poses, np.zeros((3, 8), dtype=np.int64)) == [2]
     choose_device(Device.CUDA)
@@ -150,7 +150,7 @@ def test_poses_with_too_many_candidates_are_checked_by_the_processor(
     expected = detector.detect_batch(poses)
     monkeypatch.setattr(gpu_search, "MOST_BYTES", 8 * 105)
     search = detector.gpu_search()
-    search.room = 30
+    search.candidate_capacity = 30
     assert 0 < len(search.count(poses, np.zeros((4, 8), dtype=np.int64))) < 4
     choose_device(Device.CUDA)
     found = detector.detect_batch(poses)

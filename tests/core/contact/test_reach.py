@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csgraph
 
-from lcollision_core.contact.reach import faces_within, later_vertices, surface_of
+from lcollision_core.contact.reach import faces_within, surface_of, vertices_after
 from lcollision_core.meshes.topology import length_graph
 from tests.core.shapes import Mesh, grid, join, soup
 
@@ -44,7 +44,7 @@ def test_faces_within_a_distance_are_those_of_the_shortest_paths(distance: float
 def test_later_vertices_are_those_of_the_shortest_paths(distance: float) -> None:
     mesh = sheet()
     graph = length_graph(mesh.topology.edges, mesh.vertices)
-    lists = later_vertices(surface_of(mesh.topology, mesh.vertices), distance, lambda _: None)
+    lists = vertices_after(surface_of(mesh.topology, mesh.vertices), distance, lambda _: None)
     away = csgraph.dijkstra(graph, directed=False)
     for vertex in range(len(mesh.vertices)):
         expected = np.flatnonzero(away[vertex] <= distance)

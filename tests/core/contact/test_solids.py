@@ -24,8 +24,8 @@ def where(point: np.ndarray) -> str:
 
 
 def solid_of(mesh: Mesh, open_layers: str = "auto") -> tuple[Manifold, float, list[str]]:
-    layers = solids.layers_of(mesh.vertices, mesh.faces, WALL, open_layers, where)
-    solid, filled = solids.solid_of(layers, HEIGHT, WALL, where, UNWATCHED)
+    layers = solids.split_layers(mesh.vertices, mesh.faces, WALL, open_layers, where)
+    solid, filled = solids.join_layers(layers, HEIGHT, WALL, where, UNWATCHED)
     return solid, filled, [layer.kind for layer in layers]
 
 

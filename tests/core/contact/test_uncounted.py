@@ -8,7 +8,7 @@ import pytest
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.contact import search as uncounted_module
 from lcollision_core.contact.kernels import COUNTED, LEAF_SIZE
-from lcollision_core.contact.search import NOTHING_KNOWN, make_uncounted
+from lcollision_core.contact.search import NO_TABLES, make_uncounted
 from lcollision_core.meshes import FaceGroup
 from tests.core.shapes import Mesh, grid, join, soup, sphere
 
@@ -110,13 +110,13 @@ def test_without_rules_of_places_nothing_is_made() -> None:
     for rules in (ContactRules(), ContactRules(tolerated_depth=0.1), own):
         detector, poses = _bodies(rules)
         detector.detect(poses[0], counted_only=True)
-        assert detector._uncounted.nodes(wait=True) is NOTHING_KNOWN
+        assert detector._uncounted.nodes(wait=True) is NO_TABLES
 
 
 def test_no_more_memory_is_taken_than_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uncounted_module, "MOST_BYTES", 10)
     detector, poses = _bodies(RULES["all"])
-    assert detector._uncounted.nodes(wait=True) is NOTHING_KNOWN
+    assert detector._uncounted.nodes(wait=True) is NO_TABLES
     pairs = detector.detect(poses[0], counted_only=True).pairs
     assert np.array_equal(pairs, detector.detect(poses[0]).pairs)
 

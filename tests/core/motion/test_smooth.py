@@ -10,7 +10,7 @@ from lcollision_core.motion.span_program import (
     SOFTNESS,
     HalfSpaces,
     TimeKernel,
-    _pressed,
+    _solve_lcp,
     least_corrections,
 )
 from tests.rigged_shapes import FloatArray
@@ -104,7 +104,7 @@ def test_many_contacts_that_contradict_each_other_hold_as_far_as_they_yield() ->
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         gram = normals @ normals.T + SOFTNESS * np.eye(n_contacts)
         bounds = generator.normal(size=n_contacts)
-        multipliers = _pressed(gram, bounds)
+        multipliers = _solve_lcp(gram, bounds)
         assert multipliers is not None
         left = bounds + gram @ multipliers
         assert multipliers.min() == 0.0

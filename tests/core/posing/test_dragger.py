@@ -21,7 +21,7 @@ from lcollision_core.posing import (
     Twist,
     make_grip,
 )
-from lcollision_core.posing.dragger import Decoded, Held, PatchGoal, TwistGoal
+from lcollision_core.posing.dragger import Decoded, HeldPatch, PatchGoal, TwistGoal
 
 PLAIN = DragOptions(solid=False, standing=False, whole_body=True)
 
@@ -222,7 +222,7 @@ def test_slopes_of_goals_are_those_of_differences(
 ) -> None:
     space = tube_model.space
     start = space.decode(free[None])[0]
-    pins = [Held(foot, foot.position(start) + 0.004)]
+    pins = [HeldPatch(foot, foot.position(start) + 0.004)]
     goals = [
         (PatchGoal(space, tip, pins, 0.0), tip.position(start) + np.array([0.008, -0.004, 0.002])),
         (TwistGoal(space, 0, pins, 0.0, start), np.array([0.1])),

@@ -15,7 +15,7 @@ from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import MotionOptions, resolve_motion, screen_motion
 from lcollision_core.posing import DragOptions
-from lcollision_core.posing.exact import ContactRegions, contact_slopes, lack_slopes
+from lcollision_core.posing.exact import ContactRegions, clearance_slopes, contact_slopes
 from lcollision_core.resolve import ResolveOptions, Step
 from tests.core.brute_force import distances, signed_distances
 from tests.core.motion.swings import swinging
@@ -102,7 +102,7 @@ def test_slopes_of_what_pairs_lack_are_those_of_differences() -> None:
     generator = np.random.default_rng(1)
     a = generator.uniform(-0.5, 0.5, (60, 3, 3))
     b = generator.uniform(-0.5, 0.5, (60, 3, 3)) + [0.0, 0.0, 0.1]
-    slopes = lack_slopes(a, b)
+    slopes = clearance_slopes(a, b)
     penetrates = distances(a, b) < 1e-9
     corners = np.concatenate([a, b], axis=1)
 
@@ -129,7 +129,7 @@ def test_contacts_that_do_not_touch_get_farther_against_their_slopes(
     decoded = check.decode(near)[0]
     found = check.find(check.exported(decoded))
     regions = ContactRegions.of(check.space, found)
-    deepest, slopes = contact_slopes(check.space, near, decoded, found, regions, may_be_apart=True)
+    deepest, slopes = contact_slopes(check.space, near, decoded, found, regions, has_clearance=True)
     assert found.colliding
     region = deepest[0]
     step = 1e-4 * slopes[0] / (slopes[0] @ slopes[0])
