@@ -214,7 +214,7 @@ class CollisionDetector:
         self.rules, self.groups, self.reference = rules, tuple(groups), vertices
         self.body_size = body_size(vertices, topology) if size is None else size
         if self.body_size == 0.0:
-            raise ShapeError("all vertices coincide", "use a mesh that has an extent")
+            raise ShapeError("all vertices are at one point", "use a mesh with a size")
         if not 1.0 / MAX_BODY_SIZE <= self.body_size <= MAX_BODY_SIZE:
             needed = f"{1.0 / MAX_BODY_SIZE:.0e} to {MAX_BODY_SIZE:.0e}"
             raise ShapeError.must_be("the body size", needed, f"{self.body_size:.1e}", "scale it")
@@ -614,7 +614,7 @@ class CollisionDetector:
             np.asarray(self._checked(end_pose, shape), np.float64) for end_pose in (start, end)
         ]
         if not np.isfinite(poses[1][self.topology.faces]).all():
-            raise ShapeError("a vertex is not finite", where="the pose that the path leads to")
+            raise ShapeError("a vertex is not finite", where="the end pose of the path")
         if self._path is None:
             self._path = LinearPath(self.topology, self.reference / self.body_size)
         moves = (poses[1] - poses[0])[self.topology.used_vertices]

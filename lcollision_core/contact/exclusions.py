@@ -261,10 +261,12 @@ def regions_of(
 
     Raises
     ------
-    ShapeError : the groups overlap in too many ways.
+    ShapeError : the groups overlap in too many combinations.
     """
     packed, region = np.unique(np.packbits(is_of, axis=0), axis=1, return_inverse=True)
     if packed.shape[1] > _MAX_REGIONS:
-        raise ShapeError(f"overlap in more than {_MAX_REGIONS} ways", "name fewer", where=where)
+        raise ShapeError(
+            f"overlap in more than {_MAX_REGIONS} combinations", "name fewer groups", where=where
+        )
     of_region = np.unpackbits(packed, axis=0, count=len(is_of)).astype(np.bool_)
     return region.ravel().astype(np.int32), of_region

@@ -100,7 +100,7 @@ def split_layers(
         is_flat = 2.0 * abs(volume) < _FLAT * wall * _areas(closed, all_faces).sum()
         if is_flat and open_layers == "close":
             raise LCollisionError(
-                "encloses nothing when its holes are closed",
+                "has no volume even with its holes closed",
                 "thicken open layers instead",
                 where=f"a layer {where(points.mean(axis=0))}",
             )
@@ -335,7 +335,7 @@ def _outside(layer: Layer, crossing: npt.NDArray[np.bool_], skin: float, where: 
         if solid.volume() > _SOUND * _volume(vertices, faces):
             return solid
     raise LCollisionError(
-        "crosses itself too much to be one solid",
+        "intersects itself too much to form one solid",
         "resolve or change the pose there",
         where=f"a layer {where(vertices[faces[crossing]].mean(axis=(0, 1)))}",
     )

@@ -712,7 +712,7 @@ class Embedding:
         rest = need("rest_vertices", np.float64, (None, 3), _LARGEST_COORDINATE)
         n_vertices, n_domains = len(rest), values.n_domains
         if values.n_vertices != n_vertices:
-            raise ValueError(f"it announces {values.n_vertices} vertices, but has {n_vertices}")
+            raise ValueError(f"it declares {values.n_vertices} vertices but contains {n_vertices}")
         topology = Topology(need("faces", np.int32, (None, 3)), n_vertices)
         _require_size(rest, topology)
         leading = need("alignment_weights", np.float64, (n_vertices,), _LARGEST_WEIGHT)
@@ -723,7 +723,7 @@ class Embedding:
         level1 = _read_autoencoder(arrays, "level1", np.arange(n_vertices, dtype=np.int32))
         if len(level1.components) != n_domains:
             raise ValueError(
-                f"it announces {n_domains} domains, but its level 1 has {len(level1.components)}"
+                f"it declares {n_domains} domains, but its level 1 has {len(level1.components)}"
             )
         level2, mask = [], np.zeros((n_domains, n_vertices), dtype=np.float32)
         for domain in range(n_domains):

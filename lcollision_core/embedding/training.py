@@ -84,7 +84,7 @@ def train_embedding(
     CancelledError : the job was cancelled; the checkpoint holds the last epoch.
     """
     if len(pose_set) < 2:
-        raise PoseSetError("one pose has nothing to learn from", "a pose set needs at least two")
+        raise PoseSetError("one pose isn't enough to learn from", "a pose set needs at least two")
     trainer = _Trainer(
         pose_set,
         config or EmbeddingConfig(),

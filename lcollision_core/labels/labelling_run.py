@@ -206,7 +206,7 @@ def run_on_cluster(
             ) from error
         except ImportError as error:
             raise LCollisionError(
-                f"a worker of {scheduler} lacks this program ({error})",
+                f"a worker of {scheduler} doesn't have lcollision installed ({error})",
                 f"install lcollision {program_version()} there",
             ) from error
         except (KilledWorker, LostError) as error:
@@ -236,7 +236,8 @@ def from_worker(result: _Result) -> FromWorker[_Result]:
 def _require_version(worker: str, installed: str) -> None:
     if installed != program_version():
         raise LCollisionError(
-            f"the worker {worker} has lcollision {installed}, this is {program_version()}",
+            f"worker {worker} runs lcollision {installed}, but this machine runs "
+            f"{program_version()}",
             "install the same version there",
         )
 

@@ -89,7 +89,7 @@ class LabelStore:
             is_ours = False
         if not is_ours:
             raise LabelStoreError(
-                "is not a label store", "name one that `lcollision label` made", where=path
+                "is not a label store", "give a folder made by `lcollision label`", where=path
             )
         version = manifest.get("format_version")
         if isinstance(version, int) and version > FORMAT_VERSION:
@@ -165,13 +165,13 @@ class LabelStore:
             if ours != theirs:
                 raise LabelStoreError(
                     f"labels {what.format(ours)}, not {what.format(theirs)}",
-                    "name another store, or the model and seed that this one was made with (a "
-                    "model whose embedding is trained anew is another)",
+                    "name another store, or the model and seed that this one was made with "
+                    "(retraining the embedding makes a new model)",
                     where=self.path,
                 )
         if self.identity != identity:
             raise LabelStoreError(
-                "labels another latent box than the model's",
+                "has labels for a different latent box than the model's",
                 "name another store",
                 where=self.path,
             )
@@ -250,7 +250,7 @@ class LabelStore:
             )
             expected = self.identity.box.draw(self.identity.seed, rows.start // ROWS_PER_BLOCK)
             if not np.array_equal(labelled.latent[0], expected[0]):
-                raise ValueError("rows of another place")
+                raise ValueError("the rows do not match the file name")
             _require_finite(labelled)
         except (LCollisionError, ValueError) as error:
             raise self._unreadable(rows, "damaged") from error

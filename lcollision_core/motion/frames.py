@@ -611,10 +611,10 @@ class Reason(StrEnum):
     """Why frames were not resolved."""
 
     NO_JOINT = "no joint moves them apart"
-    TOO_FAR = "what frees them moves a vertex farther than the largest change"
-    NOT_FOUND = "no way was found that moves them apart"
-    BETWEEN = "what frees them makes a pose between two frames collide"
-    AS_WRITTEN = "the form of the file cannot hold what frees them"
+    TOO_FAR = "resolving them would exceed the largest change"
+    NOT_FOUND = "no collision-free pose was found"
+    BETWEEN = "resolving them makes in-between poses collide"
+    AS_WRITTEN = "the file format can't store the correction"
     STOPPED = "it was stopped before"
 
 

@@ -574,7 +574,7 @@ class PoseDragger:
         if start.shape != space.low.shape:
             raise ShapeError.must_be("a pose to drag", f"{len(space.low)} numbers", start.shape)
         if not np.isfinite(start).all():
-            raise ShapeError("a pose to drag has a number that is not finite", "repair the pose")
+            raise ShapeError("the pose to drag contains NaN or infinity", "repair the pose")
         self._start = start
         locked = space.codes_of(self._options.locked_domains)
         locked[sorted(self._options.locked_codes)] = True

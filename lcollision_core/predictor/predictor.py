@@ -366,7 +366,7 @@ class CollisionPredictor:
                 "latent", f"of shape (B, {self.embedding.latent_size})", codes.shape
             )
         if not np.isfinite(codes).all():
-            raise ShapeError("a latent pose has a number that is not finite")
+            raise ShapeError("a latent pose contains NaN or infinity")
         return codes
 
 
@@ -392,5 +392,5 @@ def require_model(rows: LabelRows, embedding: Embedding) -> None:
         if not finite.all():
             row = start + int(np.flatnonzero(~finite)[0])
             raise ShapeError(
-                f"row {row} (from 0) has a number that is not finite", "label the samples again"
+                f"row {row} (from 0) contains NaN or infinity", "label the samples again"
             )

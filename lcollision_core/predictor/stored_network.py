@@ -57,7 +57,7 @@ def require_network(arrays: Arrays, embedding: Embedding, preset: str, by_domain
         raise ValueError("only the preset paper has a network without domains")
     others = arrays.keys() - reader.names
     if others:
-        raise ValueError(f"its array {min(others)[:60]} is not known")
+        raise ValueError(f"it has an unknown array {min(others)[:60]}")
 
 
 class _Reader:
@@ -116,10 +116,10 @@ def _require_default(reader: _Reader, embedding: Embedding) -> None:
     reader.array("body.points", 3 * n_points, n_points)
     reader.array("body.origin", 3, n_points)
     if n_points > topology.n_vertices - len(topology.unused_vertices):
-        raise ValueError(f"its {n_points} points are more than the body has vertices")
+        raise ValueError(f"it has {n_points} points, more than the body's vertices")
     sites = reader.sites()
     if sites.size and not 0 <= sites.min() <= sites.max() < topology.n_vertices:
-        raise ValueError("its array site_vertices names vertices that the body has not")
+        raise ValueError("its array site_vertices refers to vertices that the body doesn't have")
     decoder = embedding.scaling
     # Every autoencoder adds at most its scale, as |tanh| does not exceed 1.
     largest = max(

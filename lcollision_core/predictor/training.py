@@ -164,9 +164,9 @@ def train_predictor(
     n_training, n_colliding = len(colliding), int(colliding.sum())
     if not 0 < n_colliding < n_training or not len(split.held_out):
         raise LabelStoreError(
-            f"{n_colliding} of the {n_training} rows to train on collide and {len(split.held_out)} "
+            f"{n_colliding} of {n_training} training rows collide and {len(split.held_out)} rows "
             "are held out",
-            "training needs some of each: label more samples",
+            "label more samples: training needs colliding, free and held-out rows",
         )
     scale = float(energy[colliding].mean())
     if not scale > 0.0:

@@ -565,8 +565,8 @@ class PoseResolver:
         resolve_options = options or ResolveOptions()
         if self._predictor is None and not resolve_options.verify:
             raise LCollisionError(
-                "has no predictor, so its answer can't be left unchecked",
-                "resolve with the exact check",
+                "has no predictor, so Resolve needs the exact check",
+                "leave the exact check on",
                 where="the body",
             )
         target = self._checked(latent)
@@ -689,7 +689,7 @@ class PoseResolver:
         if target.shape != (size,):
             raise ShapeError.must_be("a latent pose", f"{size} numbers", f"shape {target.shape}")
         if not np.isfinite(target).all():
-            raise ShapeError("a latent pose has a number that is not finite", "repair the pose")
+            raise ShapeError("a latent pose contains NaN or infinity", "repair the pose")
         return target
 
     def problem(

@@ -198,7 +198,7 @@ def test_good_files_are_reported_beside_a_bad_one(
 
 
 UNCHECKABLE = {
-    "point.obj": ("v 3 2 1\n" * 3, "all vertices coincide"),
+    "point.obj": ("v 3 2 1\n" * 3, "all vertices are at one point"),
     "vast.obj": ("v -1.7e308 0 0\nv 1.7e308 0 0\nv 0 1 0\n", "scale it"),
     "far.obj": ("v 1e12 0 0\nv 1e12 1 0\nv 1e12 0 1\n", "vertex 0 is more than"),
 }

@@ -361,7 +361,7 @@ def test_what_shapes_a_frame_turns_with_its_joints_in_every_form(
     decoded = body.decode(np.array([pose.latent for pose in read_poses(poses, body)]))
     stuck = [n for n, frame in enumerate(decoded) if body.detector.detect(frame).colliding]
     assert row["colliding_frames"] == stuck
-    of_form = [one["frames"] for one in row["kept_spans"] if "form of the file" in one["reason"]]
+    of_form = [one["frames"] for one in row["kept_spans"] if "file format" in one["reason"]]
     assert [at for first, last in of_form for at in range(first, last + 1)] == stuck
     assert result.exit_code == (1 if stuck else 0)
 

@@ -110,7 +110,7 @@ def test_a_hull_is_thickened_if_all_are_to_be() -> None:
 
 def test_a_sheet_that_is_to_be_closed_is_refused_with_its_place() -> None:
     cloth = Mesh(grid(4).vertices * 50.0, grid(4).faces)
-    with pytest.raises(LCollisionError, match=r"near x = 25 encloses nothing .* thicken"):
+    with pytest.raises(LCollisionError, match=r"near x = 25 has no volume .* thicken"):
         solid_of(join(box([0, 0, 0], [40, 40, 100]), cloth), "close")
 
 

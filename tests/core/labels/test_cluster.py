@@ -98,7 +98,7 @@ def test_a_worker_of_another_version_is_refused(
 ) -> None:
     monkeypatch.setattr(labelling_run, "version", lambda _: "9.9")
     with pytest.raises(
-        LCollisionError, match=r"has lcollision \S+, this is 9\.9; install the same"
+        LCollisionError, match=r"runs lcollision \S+, but this machine runs 9\.9; install the same"
     ):
         label_poses(labeller, tmp_path / "store", 10, scheduler=scheduler)
 

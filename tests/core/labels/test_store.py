@@ -233,7 +233,7 @@ def test_a_store_of_something_else_is_refused_and_left_alone(
             label_poses(other, path, N_ROWS + 5000, seed=seed)
         assert str(path) in _sentence(excinfo)
     identity = LabelStore.open(path).identity
-    with pytest.raises(LabelStoreError, match="another latent box"):
+    with pytest.raises(LabelStoreError, match="different latent box"):
         LabelStore.open(path).require(replace(identity, box_low=(-9.0, *identity.box_low[1:])))
     LabelStore.open(path).require(StoreIdentity.of(labeller, SEED))
     assert files_of(path) == before

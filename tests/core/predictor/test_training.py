@@ -478,9 +478,9 @@ def test_rows_that_cannot_teach_are_refused(tube_model: LearnedBody, rows: Label
     with pytest.raises(ShapeError, match=f"have {size - 1} codes .* the model has {size}"):
         train_predictor(foreign, embedding, config())
     none = replace(rows, n_pairs=0 * rows.n_pairs)
-    with pytest.raises(LabelStoreError, match="0 of the 1050 rows to train on collide"):
+    with pytest.raises(LabelStoreError, match="0 of 1050 training rows collide"):
         train_predictor(none, embedding, config())
-    with pytest.raises(LabelStoreError, match="0 are held out"):
+    with pytest.raises(LabelStoreError, match="0 rows are held out"):
         train_predictor(rows.taken(slice(6)), embedding, config())
     with pytest.raises(LCollisionError, match="unknown device 'abacus'"):
         train_predictor(rows, embedding, PAPER, device="abacus")

@@ -535,8 +535,8 @@ def test_cancelling_a_sequence_stops_its_first_check(
     ("latent", "options", "sentence"),
     [
         (np.zeros(7), ResolveOptions(), r"must be 8 numbers, got shape \(7,\)"),
-        (np.full(8, np.nan), ResolveOptions(), "not finite"),
-        (np.full(8, np.inf), ResolveOptions(), "not finite"),
+        (np.full(8, np.nan), ResolveOptions(), "NaN or infinity"),
+        (np.full(8, np.inf), ResolveOptions(), "NaN or infinity"),
         (
             np.zeros(8),
             ResolveOptions(locked_domains=frozenset({2})),
@@ -626,7 +626,7 @@ def test_the_way_in_keeps_locked_domains_and_says_when_there_is_none(
     nothing = PoseResolver(tube_model.exact_check(), None, np.empty((0, 8))).resolve(deep, FAR)
     assert (nothing.step, nothing.exactly_free) == (Step.NONE, False)
     assert "no collision-free pose is known" in (nothing.note or "")
-    with pytest.raises(LCollisionError, match="has no predictor, so its answer"):
+    with pytest.raises(LCollisionError, match="has no predictor, so Resolve needs"):
         resolver.resolve(deep, ResolveOptions(verify=False))
     token = Job()
     token.cancel()
