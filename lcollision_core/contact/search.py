@@ -71,7 +71,9 @@ def build_tree(vertices: FloatArray, faces: IntArray, component: IntArray) -> Fa
         of_component = [np.bincount(of_face, centroids[:, c]) for c in range(3)]
         n_faces = np.maximum(np.bincount(of_face), 1)
         centroids = centroids + _APART * (np.stack(of_component) / n_faces).T[of_face]
-    size = _split_faces(centroids, order, left, right, leaf)
+    size, starts = np.full(len(left), len(faces), dtype=np.int32), np.zeros_like(left)
+    keys = np.empty(len(faces))
+    _split_faces(centroids, LEAF_SIZE, order, left, right, leaf, size, starts, keys)
     slot_face = np.full(n_leaves * LEAF_SIZE, -1, dtype=np.int32)
     slot_face[: len(faces)] = order
     corners = np.full((n_leaves * LEAF_SIZE, 3), -1, dtype=np.int32)
@@ -80,52 +82,88 @@ def build_tree(vertices: FloatArray, faces: IntArray, component: IntArray) -> Fa
     return FaceTree(slot_face, np.ascontiguousarray(by_leaf).reshape(-1), left, right, leaf, size)
 
 
-def _split_faces(
-    centroids: FloatArray, order: IntArray, left: IntArray, right: IntArray, leaf: IntArray
-) -> IntArray:
-    """Split faces at the medians of their longest extents, all nodes of a level at a time.
+@compiled_part
+def _select(keys: FloatArray, items: IntArray, start: int, stop: int, wanted: int) -> None:
+    """Partition `keys` and `items` from `start` to `stop` at index `wanted`, the smaller first.
 
-    In NumPy: to compile a loop for it would take a seventh of the wait for the first check.
+    Quickselect with random pivots and equal keys grouped, so that neither sorted nor equal keys
+    are slow.
+    """
+    low, high, state = start, stop, 12345
+    while high - low > 1:
+        state = (state * 1103515245 + 12345) % 2147483648
+        pivot = keys[low + state % (high - low)]
+        less, k, more = low, low, high
+        while k < more:
+            key = keys[k]
+            if key < pivot:
+                keys[k], keys[less] = keys[less], key
+                items[k], items[less] = items[less], items[k]
+                less += 1
+                k += 1
+            elif key > pivot:
+                more -= 1
+                keys[k], keys[more] = keys[more], key
+                items[k], items[more] = items[more], items[k]
+            else:
+                k += 1
+        if wanted < less:
+            high = less
+        elif wanted >= more:
+            low = more
+        else:
+            return
+
+
+@compiled
+def _split_faces(
+    centroids: FloatArray,
+    leaf_size: int,
+    order: IntArray,
+    left: IntArray,
+    right: IntArray,
+    leaf: IntArray,
+    size: IntArray,
+    starts: IntArray,
+    keys: FloatArray,
+) -> None:
+    """Split faces at the medians of their longest extents, parents before children.
 
     Parameters
     ----------
     centroids : (F, 3) float64 array
+    leaf_size : faces in a leaf; all but the last are full
     order : (F,) int32 array, 0 to F - 1, overwritten by the faces leaf by leaf
     left, right, leaf : (n,) int32 arrays of a `FaceTree` of n nodes, filled with -1, overwritten
-
-    Returns
-    -------
-    size : (n,) int32 array of the tree, the number of faces below each node
+    size : likewise, F for the root, which comes first
+    starts : (n,) int32 array, 0 for the root: where the faces of each node begin in `order`
+    keys : (F,) workspace. Numba would compile its allocation for as long as half of this loop.
     """
-    size, columns = np.empty_like(left), np.ascontiguousarray(centroids.T)
-    starts, stops, nodes = np.array([0]), np.array([len(order)]), np.array([0])
-    while True:
-        size[nodes] = sizes = stops - starts
-        ends = sizes <= LEAF_SIZE
-        leaf[nodes[ends]] = starts[ends] // LEAF_SIZE
-        if ends.all():
-            return size
-        starts, sizes, nodes = starts[~ends], sizes[~ends], nodes[~ends]
-        first = np.cumsum(sizes) - sizes
-        node_of = np.repeat(np.arange(len(nodes)), sizes)
-        at = np.arange(len(node_of)) + (starts - first)[node_of]
-        places = columns[:, at]
-        low, high = (end.reduceat(places, first, axis=1) for end in (np.minimum, np.maximum))
-        axis = (high - low).argmax(axis=0)
-        lower, upper = low[axis, np.arange(len(axis))], high[axis, np.arange(len(axis))]
-        # One number to sort by: the node, and in it the share of the way along its extent.
-        half = 0.5 / np.maximum(upper - lower, np.finfo(float).tiny)
-        keys = (
-            node_of + (places[axis[node_of], np.arange(len(at))] - lower[node_of]) * half[node_of]
-        )
-        sorted_at = at[keys.argsort(kind="stable")]
-        order[at], columns[:, at] = order[sorted_at], columns[:, sorted_at]
-        n_left = -(-sizes // LEAF_SIZE) // 2
-        # A subtree of n leaves has 2 n - 1 nodes, the parent first.
-        left[nodes], right[nodes] = nodes + 1, nodes + 2 * n_left
-        middles, stops = starts + n_left * LEAF_SIZE, starts + sizes
-        starts, stops = np.concatenate([starts, middles]), np.concatenate([middles, stops])
-        nodes = np.concatenate([left[nodes], right[nodes]])
+    for node in range(len(size)):
+        start, stop = starts[node], starts[node] + size[node]
+        if size[node] <= leaf_size:
+            leaf[node] = start // leaf_size
+            continue
+        longest, axis = -1.0, 0
+        for c in range(3):
+            least = most = centroids[order[start], c]
+            for k in range(start, stop):
+                place = centroids[order[k], c]
+                if place < least:
+                    least = place
+                if place > most:
+                    most = place
+            if most - least > longest:
+                longest, axis = most - least, c
+        for k in range(start, stop):
+            keys[k] = centroids[order[k], axis]
+        n_left = -(-size[node] // leaf_size) // 2
+        middle = start + n_left * leaf_size
+        _select(keys, order, start, stop, middle)
+        # A subtree of n leaves has 2 n - 1 nodes.
+        a, b = node + 1, node + 2 * n_left
+        left[node], starts[a], size[a] = a, start, middle - start
+        right[node], starts[b], size[b] = b, middle, stop - middle
 
 
 def allocate_work(tree: FaceTree, n_vertices: int) -> PoseWorkspace:
