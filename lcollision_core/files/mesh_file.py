@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -184,13 +185,18 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
         _require_usable(vertices, faces)
         own_topology = Topology(faces, len(vertices))
     vertices.flags.writeable = False
-    if topology is not None and own_topology == topology:
-        own_topology = topology
+    own_topology = topology if own_topology == topology else _shared(own_topology)
     coarseness = coarseness_of(vertices, own_topology) if polygons.is_single else None
     notes = polygons.notes + notes
     if coarseness:
         notes += (f"{coarseness}; {KEEP_PRECISION}",)
     return Mesh(vertices, own_topology, source, notes, coarseness)
+
+
+@lru_cache(maxsize=1)
+def _shared(topology: Topology) -> Topology:
+    """Return the last topology that was read if it is equal, with what was derived from it."""
+    return topology
 
 
 def coarseness_of(vertices: npt.NDArray[Any], topology: Topology) -> str | None:

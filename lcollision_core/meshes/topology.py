@@ -156,7 +156,7 @@ class Topology:
         """(M, 2) edges with more than two faces."""
         return self.edges[self._edges_and_counts[1] > 2]
 
-    @property
+    @cached_property
     def pinched_vertices(self) -> IntArray:
         """Indices of the vertices whose faces form several fans that share only the vertex."""
         # Corners of neighbouring faces at the same end of their common edge are in one fan.
