@@ -4,7 +4,7 @@
 The engine is a separate process that this add-on sends requests to.
 """
 
-from . import actions, cloth, drawing, found, link, live, operators, panel, rules
+from . import actions, cloth, drawing, link, live, operators, panel, results, rules
 
 
 def register() -> None:
@@ -15,14 +15,14 @@ def register() -> None:
     cloth.register()
     rules.register()
     drawing.register()
-    found.register()
+    results.register()
     live.register()
 
 
 def unregister() -> None:
     """Remove everything, and end the engine."""
     live.unregister()
-    found.unregister()
+    results.unregister()
     drawing.unregister()
     rules.unregister()
     cloth.unregister()

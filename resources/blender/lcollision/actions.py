@@ -13,9 +13,8 @@ from mathutils import Matrix
 
 from .client import Request
 from .controls import State, rotation_path, whole_path
-from .found import MARKER, Shown, clear, clear_frames
 from .keys import curves_of, rekey, unkeyable_bones
-from .link import Opened, Steps, waited
+from .link import OpenCharacter, Steps, wait_for
 from .operators import (
     LEAST_CHANGE,
     LEVELS,
@@ -26,8 +25,9 @@ from .operators import (
     turning,
     where,
 )
+from .results import MARKER, Shown, clear, clear_frames
 from .scene import OFF_RIG, Caution, Rigged, SceneError
-from .steps import Stepped
+from .steps import ModalOperator
 
 TOLERANCE = 5e-4
 """Largest error of curves between keys, and of bones that are not keyed: radians (0.03 degrees), or
@@ -174,7 +174,7 @@ def with_neighbours(numbers: list[int], whole: list[int]) -> tuple[list[int], ra
 def read_frames(
     context: bpy.types.Context,
     rigged: Rigged,
-    character: Opened,
+    character: OpenCharacter,
     wanted: Wanted,
     numbers: list[int],
     keep: bool,
@@ -221,10 +221,10 @@ def read_frames(
     return frames
 
 
-def _answers(character: Opened, requests: list[Request]) -> Generator[str, None, dict]:
+def _answers(character: OpenCharacter, requests: list[Request]) -> Generator[str, None, dict]:
     """Return the check of a frame, combined with those of the poses up to the next frame."""
     for request in requests:
-        yield from waited(character.engine, request, "Checking")
+        yield from wait_for(character.engine, request, "Checking")
     replies = [request.result() for request in requests]
     # The last pose belongs to the next frame.
     poses = replies[:-1] or replies
@@ -262,7 +262,7 @@ def verdict(frames: Frames, settings: bpy.types.PropertyGroup) -> str:
     return f"{bad} of {n} frames {verb}{'s' if bad == 1 else ''}{rest}"
 
 
-class LCOLLISION_OT_check_action(Stepped, bpy.types.Operator):
+class LCOLLISION_OT_check_action(ModalOperator, bpy.types.Operator):
     """Find the frames of the action in which the character runs into itself"""
 
     bl_idname = "lcollision.check_action"
@@ -280,7 +280,7 @@ class LCOLLISION_OT_check_action(Stepped, bpy.types.Operator):
         return ". ".join(filter(None, (settings.verdict, settings.details)))
 
 
-class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
+class LCOLLISION_OT_resolve_action(ModalOperator, bpy.types.Operator):
     """Copy the action and key the copy where the character runs into itself, as smooth as it was"""
 
     bl_idname = "lcollision.resolve_action"
@@ -320,10 +320,10 @@ class Resolved:
     kept : spans that the engine has not freed, with reasons; frames by index
     """
 
-    character: Opened
+    character: OpenCharacter
     wanted: Wanted
     frames: Frames
-    written: "Written | None" = None
+    written: "ActionCopy | None" = None
     unkeyable: dict[str, str] = field(default_factory=dict)
     kept: list[dict] = field(default_factory=list)
 
@@ -374,7 +374,7 @@ def resolving(
             "locked": sorted({*target.locked(), *resolved.unkeyable}),
             "turning": turning(target, settings),
         }
-        written = Written(target, frames)
+        written = ActionCopy(target, frames)
         try:
             is_done = yield from written.resolve(context, character, wanted, known)
         except BaseException:
@@ -406,7 +406,7 @@ def _targets(rigged: Rigged) -> list[Rigged]:
     return [rigged] if controls is None else [controls, rigged]
 
 
-def told_of(written: "Written", frames: Frames) -> str:
+def told_of(written: "ActionCopy", frames: Frames) -> str:
     """Return a sentence on the resolved action."""
     again = written.now
     left = len(again.colliding)
@@ -560,7 +560,7 @@ class Rows:
     jumps: set[tuple[str, str]]
 
 
-class Written:
+class ActionCopy:
     """A copy of an action, with other keys where bones are turned.
 
     Parameters
@@ -617,7 +617,7 @@ class Written:
         return now / before if before > 0.0 else 1.0
 
     def resolve(
-        self, context: bpy.types.Context, character: Opened, wanted: Wanted, asked: dict
+        self, context: bpy.types.Context, character: OpenCharacter, wanted: Wanted, asked: dict
     ) -> Iterator[str]:
         """Repeat from what Blender shows, until it is free or no longer improves.
 
@@ -642,7 +642,7 @@ class Written:
                 **asked,
                 **shown,
             )
-            reply = yield from waited(character.engine, request, "Resolving frames", progress)
+            reply = yield from wait_for(character.engine, request, "Resolving frames", progress)
             self.kept = reply["kept"]
             colliding = set(self.now.colliding)
             spans = {one: rows for one, rows in _spans(reply).items() if colliding & set(one)}
@@ -674,7 +674,7 @@ class Written:
     def _try(
         self,
         context: bpy.types.Context,
-        character: Opened,
+        character: OpenCharacter,
         wanted: Wanted,
         reply: dict,
         spans: dict[range, slice],
@@ -741,7 +741,7 @@ class Written:
     def _show(
         self,
         context: bpy.types.Context,
-        character: Opened,
+        character: OpenCharacter,
         wanted: Wanted,
         spans: Iterable[range],
         is_off: bool,

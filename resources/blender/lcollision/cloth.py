@@ -10,11 +10,11 @@ import bpy
 import numpy as np
 
 from .actions import Frames, Resolved, list_frames, read_frames, resolving, told_of
-from .found import clear
 from .link import Steps
 from .operators import counted
+from .results import clear
 from .scene import Caution, Rigged, SceneError
-from .steps import Stepped
+from .steps import ModalOperator
 
 CACHE = "LCollision Cache"
 """Name of the modifiers that show caches."""
@@ -25,7 +25,7 @@ REPORT = "Cloth Report"
 _SHOWN_OTHERWISE = "Blender shows it otherwise than its bones alone would"
 
 
-class LCOLLISION_OT_prepare_cloth(Stepped, bpy.types.Operator):
+class LCOLLISION_OT_prepare_cloth(ModalOperator, bpy.types.Operator):
     """Copy the action so that parts keep the contact gap, also between frames, for cloth solvers"""
 
     bl_idname = "lcollision.prepare_cloth"

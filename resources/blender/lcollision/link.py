@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 
 from .client import Engine, EngineError, Request, Told
-from .found import Shown
+from .results import Shown
 from .scene import Rigged, SceneError
 
 Steps = Iterator[str]
@@ -21,7 +21,7 @@ Steps = Iterator[str]
 
 
 @dataclass(frozen=True)
-class Opened:
+class OpenCharacter:
     """A character that is open in an engine.
 
     Attributes
@@ -88,7 +88,7 @@ class Opened:
 
 
 _engine: Engine | None = None
-_opened: dict[str, Opened] = {}
+_opened: dict[str, OpenCharacter] = {}
 """The last opened character of each armature, by name."""
 _own_rules: dict[str, dict] = {}
 """The original rules of each character open in the engine, by its hash."""
@@ -188,7 +188,7 @@ def forget() -> None:
     _opened.clear()
 
 
-def waited(
+def wait_for(
     engine: Engine, request: Request, text: str, progress: list | None = None
 ) -> Generator[str, None, dict]:
     """Wait for an answer step by step, and return it; cancel the request if the steps are closed.
@@ -209,9 +209,9 @@ def waited(
     return request.result()
 
 
-def opening(
+def open_steps(
     rigged: Rigged, rules: dict, poses: np.ndarray | None = None
-) -> Generator[str, None, Opened]:
+) -> Generator[str, None, OpenCharacter]:
     """Start the engine if it does not run, and open the present character with these rules.
 
     It replaces the armature's earlier character, which the engine then closes.
@@ -231,14 +231,14 @@ def opening(
     character = rigged.as_character()
     n_vertices = {part["name"]: len(part["vertices"]) for part in character["parts"]}
     request = asked.send("open_mesh", poses=poses, **character)
-    answer = yield from waited(asked, request, "Opening the character")
-    found = Opened(asked, key, rules, n_vertices, answer)
+    answer = yield from wait_for(asked, request, "Opening the character")
+    found = OpenCharacter(asked, key, rules, n_vertices, answer)
     own = _own_rules.setdefault(answer["character"], answer["rules"])
-    reply = yield from waited(asked, found.send("rules"), "Reading the rules")
+    reply = yield from wait_for(asked, found.send("rules"), "Reading the rules")
     answer["groups"] = reply["groups"]
     lists = {name: [*own[name], *rules.get(name, [])] for name in ("ignored", "touching")}
     request = found.send("set_rules", rules={**own, **rules, **lists})
-    reply = yield from waited(asked, request, "Setting the rules")
+    reply = yield from wait_for(asked, request, "Setting the rules")
     answer["in_words"] = reply["in_words"]
     _opened[name] = found
     if not n_going_on:
@@ -249,7 +249,7 @@ def opening(
     return found
 
 
-def known(rigged: Rigged, rules: dict) -> Opened | None:
+def known(rigged: Rigged, rules: dict) -> OpenCharacter | None:
     """Return the opened character if it has not changed and has these rules, else None."""
     found = _opened.get(rigged.armature.name)
     if found is None or not found.engine.is_alive:

@@ -4,7 +4,7 @@
 import bpy
 from bpy.app.handlers import persistent
 
-from . import drawing, found, link
+from . import drawing, link, results
 from .client import EngineError, Request
 from .scene import Rigged, SceneError
 
@@ -14,7 +14,7 @@ _EVERY = 0.05
 _is_on = False
 _is_newer = False
 _asked: Request | None = None
-_shown: found.Shown | None = None
+_shown: results.Shown | None = None
 _opening: link.Steps | None = None
 """The pending check and the character it applies to, or the steps of opening the character."""
 
@@ -77,10 +77,10 @@ def _look() -> float | None:
     try:
         look()
     except SceneError as error:
-        found.clear()
+        results.clear()
         bpy.context.scene.lcollision.verdict = str(error)
     except EngineError as error:
-        found.clear()
+        results.clear()
         settings = bpy.context.scene.lcollision
         settings.live, settings.verdict = False, str(error)
     return _EVERY
@@ -107,13 +107,13 @@ def look() -> bool:
         _opening, known = None, link.known(rigged, rules)
     elif _asked is not None:
         answer, _asked = _asked, None
-        found.show(rigged, answer.result(), _shown)
+        results.show(rigged, answer.result(), _shown)
     if known is not None and not _is_newer:
         return True
     if known is None:
-        _opening = link.opening(rigged, rules)
+        _opening = link.open_steps(rigged, rules)
         return False
     _is_newer = False
-    _shown = found.Shown.of(rigged)
+    _shown = results.Shown.of(rigged)
     _asked = known.check(rigged, known.clearance(rigged), _shown)
     return False

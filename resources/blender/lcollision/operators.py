@@ -6,12 +6,12 @@ from collections.abc import Generator
 import bpy
 import numpy as np
 
-from . import found
-from .found import Shown
+from . import results
 from .keys import check_keyable, unkeyable_bones
-from .link import Opened, Steps, opening, waited
+from .link import OpenCharacter, Steps, open_steps, wait_for
+from .results import Shown
 from .scene import Caution, Rigged, SceneError
-from .steps import Stepped
+from .steps import ModalOperator
 
 LEVELS = ((0.0, 0.0), (0.03, 1.0), (0.1, 2.0))
 """Pairs of the overshoot, as a share of the correction, and the extra clearance, in remaining
@@ -38,10 +38,10 @@ def is_worse(after: dict, before: dict) -> bool:
 
 def open_character(
     rigged: Rigged, settings: bpy.types.PropertyGroup, poses: np.ndarray | None = None
-) -> Generator[str, None, Opened]:
+) -> Generator[str, None, OpenCharacter]:
     """Open the present character, and list its groups in the panel."""
-    found.clear()
-    character = yield from opening(rigged, settings.chosen_rules(rigged), poses)
+    results.clear()
+    character = yield from open_steps(rigged, settings.chosen_rules(rigged), poses)
     settings.of, settings.left_out = rigged.armature.name, rigged.left_out_lines()
     settings.rules = character.answer["in_words"]
     settings.groups.clear()
@@ -97,7 +97,7 @@ def counted(n: int, noun: str) -> str:
     return f"{n} {noun}{'' if n == 1 else 's'}"
 
 
-class LCOLLISION_OT_check_pose(Stepped, bpy.types.Operator):
+class LCOLLISION_OT_check_pose(ModalOperator, bpy.types.Operator):
     """Find where the character as it is shown runs into itself"""
 
     bl_idname = "lcollision.check_pose"
@@ -111,12 +111,12 @@ class LCOLLISION_OT_check_pose(Stepped, bpy.types.Operator):
         character = yield from open_character(rigged, settings)
         shown = Shown.of(rigged)
         request = character.check(rigged, character.clearance(rigged), shown)
-        reply = yield from waited(character.engine, request, "Checking the pose")
-        found.show(rigged, reply, shown)
+        reply = yield from wait_for(character.engine, request, "Checking the pose")
+        results.show(rigged, reply, shown)
         return settings.verdict
 
 
-class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
+class LCOLLISION_OT_resolve_pose(ModalOperator, bpy.types.Operator):
     """Turn the bones to the nearest pose in which the character does not run into itself"""
 
     bl_idname = "lcollision.resolve_pose"
@@ -132,9 +132,9 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
         character = yield from open_character(rigged, settings)
         shown = Shown.of(rigged)
         request = character.check(rigged, character.clearance(rigged), shown)
-        first = yield from waited(character.engine, request, "Checking the pose")
+        first = yield from wait_for(character.engine, request, "Checking the pose")
         if not first["colliding"]:
-            found.show(rigged, first, shown)
+            results.show(rigged, first, shown)
             return f"{settings.verdict}: nothing was changed"
         points, resolving = shown.vertices, None
         controls = rigged.by_controls() if rigged.is_driven else None
@@ -151,13 +151,13 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
             context.view_layer.update()
         best, reply, target = resolving.best, resolving.reply, resolving.rigged
         if not is_done:
-            found.show(rigged, first, Shown.of(rigged))
+            results.show(rigged, first, Shown.of(rigged))
             told = f"{settings.verdict}: no better pose was found, nothing was changed"
             return Caution(f"{told}; {reply['note']}".rstrip("; "))
         target.put(resolving.kept)
         context.view_layer.update()
         shown = Shown.of(target)
-        found.show(target, best, shown)
+        results.show(target, best, shown)
         if is_keyed:
             for (name, path), value in resolving.kept.items():
                 if value != resolving.basis[name, path]:
@@ -193,7 +193,7 @@ class _Resolving:
     by_fk : limbs that were switched to FK for it
     """
 
-    def __init__(self, rigged: Rigged, character: Opened, first: dict, shown: Shown) -> None:
+    def __init__(self, rigged: Rigged, character: OpenCharacter, first: dict, shown: Shown) -> None:
         self.rigged, self.best, self.reply = rigged, first, {"note": ""}
         self.basis = self.kept = None
         self.by_fk: set[str] = set()
@@ -236,7 +236,7 @@ class _Resolving:
                 clearance=clearance + margin * self.best["deepest"],
                 **start,
             )
-            self.reply = reply = yield from waited(
+            self.reply = reply = yield from wait_for(
                 character.engine, request, "Resolving the pose, step", progress
             )
             if self.basis is None:
@@ -253,7 +253,7 @@ class _Resolving:
             context.view_layer.update()
             shown = Shown.of(self.rigged)
             request = character.check(self.rigged, clearance, shown)
-            after = yield from waited(character.engine, request, "Checking the result")
+            after = yield from wait_for(character.engine, request, "Checking the result")
             if is_worse(after, first) or _cost(after) >= _cost(self.best):
                 level += 1
                 if level == len(LEVELS):

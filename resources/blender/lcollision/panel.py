@@ -15,7 +15,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import found, live
+from . import live, results
 from .operators import counted
 from .scene import HIDDEN, OFF_RIG, Rigged, SceneError
 
@@ -327,7 +327,7 @@ def _draw_verdict(
         box.label(text=_NOT_CHECKED)
         return
     column = box.column()
-    column.active = not (settings.is_of_pose and found.is_stale)
+    column.active = not (settings.is_of_pose and results.is_stale)
     is_bad = settings.verdict.startswith(("Colliding", "Still", "Too near"))
     is_good = "(checked" in settings.verdict
     icon = "ERROR" if is_bad else "CHECKMARK" if is_good else "NONE"

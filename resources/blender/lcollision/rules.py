@@ -6,13 +6,13 @@ import json
 import bpy
 import numpy as np
 
-from . import drawing, found
+from . import drawing, results
 from .actions import action_of, frame_range
-from .found import Shown
-from .link import Steps, waited
+from .link import Steps, wait_for
 from .operators import array, counted, open_character
+from .results import Shown
 from .scene import Rigged
-from .steps import Stepped
+from .steps import ModalOperator
 
 _FEWEST_POSES, _MOST_POSES = 8, 40
 """Limits of the number of evenly spaced frames in which touching places are looked for."""
@@ -51,7 +51,7 @@ class LCOLLISION_OT_count_pair(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LCOLLISION_OT_propose(Stepped, bpy.types.Operator):
+class LCOLLISION_OT_propose(ModalOperator, bpy.types.Operator):
     """Find places that touch in nearly every pose, as a belt and a jacket do, and show them"""
 
     bl_idname = "lcollision.propose"
@@ -79,7 +79,7 @@ class LCOLLISION_OT_propose(Stepped, bpy.types.Operator):
             lambda *told: progress.extend(told),
             vertices=np.array(poses) if len(poses) >= _FEWEST_POSES else None,
         )
-        reply = yield from waited(character.engine, request, "Looking at poses", progress)
+        reply = yield from wait_for(character.engine, request, "Looking at poses", progress)
         if not reply["touching"]:
             settings.proposal = settings.proposed = ""
             return "No places touch in nearly every pose"
@@ -92,7 +92,7 @@ class LCOLLISION_OT_propose(Stepped, bpy.types.Operator):
         )
         faces = np.unique(array(reply["faces"]))
         colours = np.tile(drawing.PROPOSED, (len(faces), 1))
-        found.tint(rigged, faces, colours, Shown.of(rigged))
+        results.tint(rigged, faces, colours, Shown.of(rigged))
         return settings.proposed
 
 
@@ -115,7 +115,7 @@ class LCOLLISION_OT_ignore_places(bpy.types.Operator):
             proposal["touching"] += before["touching"]
         settings.places = json.dumps(proposal)
         settings.proposal = settings.proposed = ""
-        found.clear()
+        results.clear()
         return {"FINISHED"}
 
 
@@ -129,7 +129,7 @@ class LCOLLISION_OT_count_places(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set:
         """Clear the places."""
         context.scene.lcollision.places = ""
-        found.clear()
+        results.clear()
         return {"FINISHED"}
 
 

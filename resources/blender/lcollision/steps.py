@@ -13,7 +13,7 @@ _TICK, _SHARE = 0.05, 0.6
 """Seconds between two ticks, and the share of that spent working."""
 
 
-class Stepped:
+class ModalOperator:
     """An operator whose work is `steps`: at once by a script, tick by tick in the interface."""
 
     bl_options = {"REGISTER", "UNDO"}

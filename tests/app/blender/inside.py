@@ -474,7 +474,7 @@ def carried_meshes(path):
         }
 
     answer |= {"lowered": check(), "before": seen(armature)}
-    found = module("found")._reply
+    found = module("results")._reply
     answer["counts"] = {"pairs": found["pairs"], "left_out": found["excluded_pairs"]}
     staff.lcollision_is_checked = False
     answer |= {"unticked": check(), "panel_without": drawn("LCOLLISION_PT_panel")}
@@ -891,7 +891,7 @@ def failing(path, clip, kind):
 
 def failing_pose(path, kind):
     """Resolve a pose while the check of the result fails because the engine ends."""
-    opened = module("link").Opened
+    opened = module("link").OpenCharacter
     armature = load(path)
     if kind == "baked":
         held_by(armature, "COPY_ROTATION")(105.0)
@@ -1027,7 +1027,9 @@ def stand_in(kind, reports):
     def report(self, kinds, text):
         reports.append([*kinds, text])
 
-    return type("StandIn", (module("steps").Stepped,), {"steps": kind.steps, "report": report})()
+    return type(
+        "StandIn", (module("steps").ModalOperator,), {"steps": kind.steps, "report": report}
+    )()
 
 
 def event(kind):

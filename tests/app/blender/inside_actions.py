@@ -22,17 +22,17 @@ def reported(kind):
 def spans_of(armature, n_frames, do):
     """Call `do`, which resolves an action; return its spans and the points before and after."""
     actions, tried, scene = inside.module("actions"), set(), bpy.context.scene
-    rows_of = actions.Written._rows
+    rows_of = actions.ActionCopy._rows
 
     def record(self, turned):
         tried.update((one.start, one.stop) for one in turned)
         return rows_of(self, turned)
 
-    actions.Written._rows = record
+    actions.ActionCopy._rows = record
     frames = range(scene.frame_start, scene.frame_start + n_frames)
     before = points_of_frames(armature, frames)
     answer = {"said": do(), "before": before}
-    actions.Written._rows = rows_of
+    actions.ActionCopy._rows = rows_of
     spans = []
     for start, stop in sorted(tried):
         if spans and start <= spans[-1][1]:
@@ -327,7 +327,7 @@ def mirrored(path):
     inside.mirror(inside.meshes_of(armature)[0])
     swing(armature)
     link, asked = inside.module("link"), []
-    send = link.Opened.send
+    send = link.OpenCharacter.send
 
     def record(self, kind, *arguments, **values):
         asked.append(kind)
@@ -343,9 +343,9 @@ def mirrored(path):
                 flat = [half(one) for one in self.turns.reshape(-1, 4, 4)]
                 self.turns = np.array(flat).reshape(self.turns.shape)
 
-    link.Opened.send, actions.Turned = record, Half
+    link.OpenCharacter.send, actions.Turned = record, Half
     answer = {"said": reported(actions.LCOLLISION_OT_resolve_action)}
-    link.Opened.send, actions.Turned = send, kind
+    link.OpenCharacter.send, actions.Turned = send, kind
     new = inside.keys(armature.animation_data.action, armature)
     return answer | {
         "verdict": inside.settings().verdict,
@@ -377,7 +377,7 @@ def worse(path):
     swing(armature, ((1, 60.0), (8, 105.0), (15, 60.0), (60, 60.0), (67, 105.0), (74, 60.0)))
     bpy.context.scene.frame_start = 1
     before, answer, shown, first = state(armature), {}, [], {}
-    turn, read, show = kind.turn, actions.read_frames, actions.Written._show
+    turn, read, show = kind.turn, actions.read_frames, actions.ActionCopy._show
     left, right = (rigged().bones.index(name) for name in ("LeftArm", "RightArm"))
     deeper = deeper_turn(armature, 12.0)
 
@@ -421,9 +421,9 @@ def worse(path):
 
     # One step's result is enough here: further ones only cost time.
     most, actions.MOST_STEPS = actions.MOST_STEPS, 1
-    kind.turn, actions.Written._show = turn_deeper, look
+    kind.turn, actions.ActionCopy._show = turn_deeper, look
     resolve("all")
-    answer["shown"], actions.Written._show = shown, show
+    answer["shown"], actions.ActionCopy._show = shown, show
     bpy.context.scene.frame_set(6)
     pose = inside.rotations(armature)
     answer["pose"] = reported(operators.LCOLLISION_OT_resolve_pose)
