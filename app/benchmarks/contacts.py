@@ -55,7 +55,7 @@ _HELD = Arm(lift=36.0, plane=0.0, turn=45.0, elbow=110.0, pronation=20.0, wrist=
 """An arm with its hand on the belly."""
 
 
-def built(build: str) -> tuple[RigBody, Template]:
+def build_figure(build: str) -> tuple[RigBody, Template]:
     """Return the built-in figure in one of the `BUILDS`, as a rigged body.
 
     Raises
@@ -98,7 +98,7 @@ def built(build: str) -> tuple[RigBody, Template]:
     return RigBody.of(character), template
 
 
-def dances(body: RigBody, template: Template) -> list[Motion]:
+def sample_motions(body: RigBody, template: Template) -> list[Motion]:
     """Return three motions of a built body: a dance, a jump, and hands put on the belly."""
     skeleton = template.skeleton
     figures = {
@@ -201,13 +201,13 @@ def contact_rows(
     ----------
     files : of characters with clips
     """
-    builds = {build: built(build) for build in BUILDS}
+    builds = {build: build_figure(build) for build in BUILDS}
     average, template = builds["average"]
     others = [body for name, (body, _) in builds.items() if name != "average"]
     characters = [(path, open_character(path)) for path in files]
     rigged = [body for _, body in characters]
     rows: list[Row] = []
-    for motion in dances(average, template):
+    for motion in sample_motions(average, template):
         rows += score_contacts(average, motion, [*others, *rigged], workers, job)
     for path, body in characters:
         others = [one for one in (average, *rigged) if one is not body]

@@ -236,7 +236,7 @@ class Session(QObject):
         chance = random.Random(0)
         for _ in range(_EVENTS):
             start = time.perf_counter()
-            self._slider.move_to(chance.uniform(*self._slider.ends))
+            self._slider.move_to(chance.uniform(*self._slider.value_range))
             self.wait_for(self.is_shown)
             ended, render = self._last_paint
             compose = self._last_swap - self._composing
@@ -252,7 +252,7 @@ class Session(QObject):
         while done < _BURST_EVENTS:
             due = int(_BURST_EVENTS * (time.monotonic() - start) / _BURST_SECONDS) + 1
             for event in range(done, min(due, _BURST_EVENTS)):
-                low, high = self._slider.ends
+                low, high = self._slider.value_range
                 self._slider.move_to(low + (event + 1) / _BURST_EVENTS * (high - low))
             last = time.monotonic()
             done = max(done, min(due, _BURST_EVENTS))

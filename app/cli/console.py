@@ -17,7 +17,7 @@ from lcollision_core.tasks.words import one_line
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
 
-Told = tuple[float, float, str, list[str]]
+BarContent = tuple[float, float, str, list[str]]
 """The content of a progress bar: done, total, description, and facts beside it."""
 
 SECONDS_BETWEEN_LINES = 30.0
@@ -85,7 +85,7 @@ def progress_bar(task: str, job: Job | None = None) -> Iterator[Job]:
 @contextmanager
 def status_bar(
     task: str,
-    told_of: Callable[[Any], Told],
+    bar_content: Callable[[Any], BarContent],
     job: Job = UNWATCHED,
     *,
     rows: bool = False,
@@ -97,7 +97,7 @@ def status_bar(
     Parameters
     ----------
     task : the description until the first status
-    told_of : converts a reported status to the content of the bar
+    bar_content : converts a reported status to the content of the bar
     rows : show the done and total counts, not the percentage and the time left
     estimates : whether the bar estimates the time left, if the facts do not contain it
     seconds : least time between notes in a file or a pipe; `SECONDS_BETWEEN_LINES` if None
@@ -105,11 +105,11 @@ def status_bar(
     if sys.stderr.isatty():
         amounts = ("count",) if rows else ("share", "time") if estimates else ("share",)
         with _bar(task, *amounts) as show:
-            yield job.part(lambda status: show(*told_of(status)))
+            yield job.part(lambda status: show(*bar_content(status)))
         return
 
     def tell_status(status: Any) -> None:
-        done, total, description, facts = told_of(status)
+        done, total, description, facts = bar_content(status)
         amount = f"{done:.0f} of {total:.0f}" if rows else f"{100.0 * done / total:.0f} %"
         note(", ".join([f"{description}: {amount}", *facts]))
 

@@ -22,7 +22,7 @@ from lcollision_core.options import Draws
 from lcollision_core.tasks.words import counted
 
 if TYPE_CHECKING:
-    from app.cli.console import Told
+    from app.cli.console import BarContent
     from lcollision_core.bodies import LearnedBody
     from lcollision_core.labels import LabelStatus
 
@@ -96,7 +96,7 @@ def label(
     labeller = model.labeller(wanted_draws)
     started = time.monotonic()
     try:
-        with cancel_on_interrupt() as job, status_bar(_TASK, told_of, job, rows=True) as job:
+        with cancel_on_interrupt() as job, status_bar(_TASK, bar_content, job, rows=True) as job:
             status = label_poses(
                 labeller,
                 output,
@@ -162,7 +162,7 @@ def _check(model: LearnedBody, path: Path, as_json: bool) -> None:
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
-def told_of(status: LabelStatus) -> Told:
+def bar_content(status: LabelStatus) -> BarContent:
     """Describe the rows, the rate, the time left and the colliding fraction."""
     facts = []
     if status.rows_per_second is not None and status.seconds_left is not None:

@@ -20,7 +20,7 @@ from lcollision_core.options import LearningRequest
 from lcollision_core.tasks.words import duration_text, error_rates, spent_text
 
 if TYPE_CHECKING:
-    from app.cli.console import Told
+    from app.cli.console import BarContent
     from lcollision_core.learning_state import LearningStatus
     from lcollision_core.tasks.learning import LearnedCard
 
@@ -45,7 +45,7 @@ def new(
     The contact rules are proposed from the poses unless options give them. You can stop it at any
     time; the same command resumes.
     """
-    from app.work.learner import STOP, obeying
+    from app.work.learner import STOP, cancel_on_stop_file
     from lcollision_core.bodies import LearnedBody, model_destination
     from lcollision_core.files import unused_name
     from lcollision_core.tasks.learning import MostlyCollidingError, learn_model
@@ -61,8 +61,8 @@ def new(
     try:
         with (
             cancel_on_interrupt() as job,
-            obeying(work, job),
-            status_bar("reading files", told_of_learning, job, estimates=False) as job,
+            cancel_on_stop_file(work, job),
+            status_bar("reading files", bar_content_of_learning, job, estimates=False) as job,
         ):
             card = learn_model(work, job)
     except CancelledError:
@@ -123,7 +123,7 @@ def _print(card: LearnedCard) -> None:
     )
 
 
-def told_of_learning(status: LearningStatus) -> Told:
+def bar_content_of_learning(status: LearningStatus) -> BarContent:
     """Describe the stage, its progress and the time left."""
     stage = f"{status.stage} {100.0 * status.stage_done:.0f} %"
     left = f"{duration_text(status.seconds_left or 0.0)} left"

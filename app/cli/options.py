@@ -17,7 +17,7 @@ from lcollision_core.options import Option, limits_of
 _BY_NAME = inspect.Parameter.KEYWORD_ONLY
 
 
-class Without(frozenset[str]):
+class Excluding(frozenset[str]):
     """In `Annotated` of a command's parameter: fields that are not options of that command."""
 
 
@@ -35,7 +35,7 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
         if not is_dataclass(kind):
             parameters.append(parameter.replace(annotation=hint, kind=_BY_NAME))
             continue
-        left_out = next((extra for extra in extras if isinstance(extra, Without)), Without())
+        left_out = next((extra for extra in extras if isinstance(extra, Excluding)), Excluding())
         options_of_field = _options_of(kind)
         offered = [f for f in fields(kind) if f.name in options_of_field and f.name not in left_out]
         offered.sort(key=lambda field: bool(field.kw_only))

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from app.cli.console import (
+    BarContent,
     ExitStatus,
     JsonOption,
-    Told,
     note,
     print_json,
     progress_bar,
@@ -30,7 +30,7 @@ from app.cli.inputs import (
 )
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
-from app.cli.options import Without, refuse_given, takes_options
+from app.cli.options import Excluding, refuse_given, takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
@@ -77,7 +77,7 @@ def resolve(
     model_name: ModelArgument,
     output: FormOutput,
     options: ResolveOptions,
-    request: Annotated[ExportRequest, Without({"axes", "scale", "fps"})],
+    request: Annotated[ExportRequest, Excluding({"axes", "scale", "fps"})],
     choice: MotionChoice,
     of_motion: MotionOptions,
     rules: RuleOptions,
@@ -363,7 +363,7 @@ def _resolve_motions(
             if not isinstance(row, FailedFile):
                 (note if as_json else tell)(resolved_clip_text(row))
 
-    def told_of(status: FolderStatus) -> Told:
+    def bar_content(status: FolderStatus) -> BarContent:
         tell_rows(status.rows)
         left = status.seconds_left
         facts = [f"{duration_text(left)} left"] if left else []
@@ -373,7 +373,7 @@ def _resolve_motions(
     rows = list[Row]()
     with cancel_on_interrupt() as job:
         if each:
-            with status_bar(task, told_of, job, rows=True, seconds=0.0) as job:
+            with status_bar(task, bar_content, job, rows=True, seconds=0.0) as job:
                 rows = resolve_folder(request, job)
         else:
             with progress_bar(task, job) as job:

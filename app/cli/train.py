@@ -34,7 +34,7 @@ from lcollision_core.options import RuleOptions
 from lcollision_core.tasks.words import error_rates
 
 if TYPE_CHECKING:
-    from app.cli.console import Told
+    from app.cli.console import BarContent
     from lcollision_core.embedding.training_run import TrainingStatus
     from lcollision_core.predictor import PredictorStatus
 
@@ -123,7 +123,7 @@ def embedding(
     require_writable(checkpoint)
     with (
         _resumable(checkpoint, Path.exists) as job,
-        status_bar("reading features", told_of_embedding, job) as job,
+        status_bar("reading features", bar_content_of_embedding, job) as job,
     ):
         model = learn_latent_space(
             destination.stem,
@@ -196,7 +196,9 @@ def predictor(
     leads = os.environ.get("RANK", "0") == "0"
     with (
         _resumable(checkpoint, has_begun, leads) as job,
-        status_bar("reading rows", told_of_predictor, job) if leads else nullcontext(job) as job,
+        status_bar("reading rows", bar_content_of_predictor, job)
+        if leads
+        else nullcontext(job) as job,
     ):
         learned = learn_predictor(
             model,
@@ -248,7 +250,7 @@ def _resumable(
         raise
 
 
-def told_of_embedding(status: TrainingStatus) -> Told:
+def bar_content_of_embedding(status: TrainingStatus) -> BarContent:
     """Describe the stage and the errors of both levels."""
     levels = {"level 1": status.level1_error, "both levels": status.both_error}
     errors = [f"{name} {100.0 * e:.2f} %" for name, e in levels.items() if e is not None]
@@ -256,7 +258,7 @@ def told_of_embedding(status: TrainingStatus) -> Told:
     return status.done, status.total, f"{status.model}: learning {status.stage}", facts
 
 
-def told_of_predictor(status: PredictorStatus) -> Told:
+def bar_content_of_predictor(status: PredictorStatus) -> BarContent:
     """Describe the epoch, the loss and the held-out error rates."""
     if status.preparing is not None:
         return status.preparing, 1.0, "labelling patches", []

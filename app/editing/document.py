@@ -128,8 +128,8 @@ class PoseDocument(QObject):
         # Everything is in place before any signal: a slot sees only poses of this model, and may
         # edit at once.
         self.model_changed.emit()
-        self.history.tell_all()
-        self.motion.tell_all()
+        self.history.emit_all()
+        self.motion.emit_all()
         self.library.changed.emit()
 
     def new_pose(self) -> None:

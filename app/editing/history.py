@@ -18,7 +18,7 @@ from PySide6.QtGui import QUndoCommand, QUndoStack
 from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
-    from app.work.frames import OwnSpace
+    from app.work.frames import SpaceFactory
     from lcollision_core.bodies import Body, NamedPose, PoseLibrary
     from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion
@@ -69,7 +69,7 @@ class Moment:
     frame: int
 
     @property
-    def space(self) -> OwnSpace | None:
+    def space(self) -> SpaceFactory | None:
         """The body's space in this frame; None if it is the same in all frames."""
         frame_space = self.motion.space_at
         return None if frame_space is None else partial(frame_space, self.frame)
@@ -182,7 +182,7 @@ UNDO_STEPS = 1000
 class MotionEdits(Protocol):
     """Turns edits of frames into edits of their motion."""
 
-    def settled(self, state: DocumentState) -> DocumentState:
+    def with_motion_edit(self, state: DocumentState) -> DocumentState:
         """Return the state to apply when an action ends in `state`."""
 
     def are_saved(self) -> bool:
@@ -226,7 +226,7 @@ class PoseHistory(QObject):
     file : the poses file that Save writes; if None, Save asks for one
     file_stamp : the stamp of `file` when it was last opened or saved here
     file_poses : the poses of the opened file, which Save writes unchanged
-    opened : a token of what was opened last, replaced with every file and new pose
+    document_token : a token of what was opened last, replaced with every file and new pose
     store : the user's library of the model; None before the first model
     ghost_shown : whether a ghost is drawn if there is one; see `show_ghost`
     motions : handles edits of a motion's frames; None without a timeline
@@ -266,7 +266,7 @@ class PoseHistory(QObject):
         self.file: Path | None = None
         self.file_stamp: FileStamp | None = None
         self.file_poses: tuple[NamedPose, ...] = ()
-        self.opened = object()
+        self.document_token = object()
         self._saved: NamedPose | None = None
         self.ghost_shown = True
         self.motions: MotionEdits | None = None
@@ -359,7 +359,7 @@ class PoseHistory(QObject):
             step = ChangeState(gesture.label, self.apply, before, after, gesture.run)
             self.undo_stack.push(step)
         self.gesture_closed.emit()
-        self.tell_modified()
+        self.update_modified()
 
     def cancel_gesture(self) -> None:
         """End the gesture and restore the state that it began with."""
@@ -401,10 +401,10 @@ class PoseHistory(QObject):
         self._saved = self.pose
         if self.motions is not None:
             self.motions.mark_saved()
-        self.tell_modified()
+        self.update_modified()
 
     def _settled(self, state: DocumentState) -> DocumentState:
-        return state if self.motions is None else self.motions.settled(state)
+        return state if self.motions is None else self.motions.with_motion_edit(state)
 
     @property
     def state(self) -> DocumentState:
@@ -436,14 +436,14 @@ class PoseHistory(QObject):
         return replace(self.state, pose=pose, ghost=None, outcome=None)
 
     def set_model(self, model: Body, file: str, store: PoseLibrary) -> None:
-        """Start with the first pose of another model, without signals: see `tell_all`."""
+        """Start with the first pose of another model, without signals: see `emit_all`."""
         self._model, self.model_file = model, file
         pose = self._blank()
         self.store, self.file, self.file_poses = store, None, ()
         self.gesture, self._held, self._saved = None, DocumentState(pose), pose
-        self.opened = object()
+        self.document_token = object()
 
-    def tell_all(self) -> None:
+    def emit_all(self) -> None:
         """Emit every change signal, as after loading another model."""
         for changed in (
             self.latent_changed,
@@ -455,7 +455,7 @@ class PoseHistory(QObject):
             self.moment_changed,
         ):
             changed.emit()
-        self.tell_modified()
+        self.update_modified()
 
     def push(self, label: str, state: DocumentState, run: int | None = None) -> None:
         """Apply another state, as an undo step of its own or as part of the gesture."""
@@ -477,7 +477,7 @@ class PoseHistory(QObject):
             later.before = state
         self.apply(state)
 
-    def keep_saved(self, asked: NamedPose, pose: NamedPose, file: Path) -> None:
+    def mark_saved_as(self, asked: NamedPose, pose: NamedPose, file: Path) -> None:
         """Record that `file` now contains a pose; amend the undo steps if it is still current.
 
         Parameters
@@ -492,12 +492,12 @@ class PoseHistory(QObject):
                 origin = Origin(Source.FILE, pose)
             self.amend(replace(self.state, pose=pose, origin=origin))
         self.file_changed.emit()
-        self.tell_modified()
+        self.update_modified()
 
-    def keep_unsaved(self) -> None:
+    def mark_unsaved(self) -> None:
         """Mark the pose as saved nowhere, as after recovery from a crash."""
         self._saved = None
-        self.tell_modified()
+        self.update_modified()
 
     def exchange_model(self, model: Body, file: str) -> None:
         """Replace the model by a changed version of itself; the pose stays."""
@@ -535,7 +535,7 @@ class PoseHistory(QObject):
         file_poses: tuple[NamedPose, ...] = (),
     ) -> None:
         """Set a state, marked as saved, and clear the history."""
-        self.gesture, self.opened = None, object()
+        self.gesture, self.document_token = None, object()
         self.file, self.file_poses, self._saved = file, file_poses, state.pose
         self.apply(state)
         self.undo_stack.clear()
@@ -560,9 +560,9 @@ class PoseHistory(QObject):
             self.moment_changed.emit()
             if (state.moment is None) != (before.moment is None):
                 self.moment_entered.emit()
-        self.tell_modified()
+        self.update_modified()
 
-    def tell_modified(self) -> None:
+    def update_modified(self) -> None:
         """Signal `changed` and `modified` if they have changed."""
         if self.changed != self._told_changed:
             self._told_changed = self.changed

@@ -248,7 +248,7 @@ class Library(QObject):
             before = store.poses
             store.take(written)
             if store is not self._history.store or store.poses == before:
-                self._history.tell_modified()
+                self._history.update_modified()
             else:
                 # Another program has changed it too.
                 self._tell_changed()
@@ -261,7 +261,7 @@ class Library(QObject):
 
     def _tell_changed(self) -> None:
         self.changed.emit()
-        self._history.tell_modified()
+        self._history.update_modified()
 
     def _report(self, error: LCollisionError) -> None:
         self.failed.emit(Failure.of(error))

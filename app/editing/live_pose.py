@@ -11,7 +11,7 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.history import PoseHistory, read_only
-from app.work.frames import MeasuredFrame, OwnSpace, PoseFrame, no_points
+from app.work.frames import MeasuredFrame, PoseFrame, SpaceFactory, empty_points
 from app.work.pose_worker import CodeTarget, GripTarget, MotionStart, PoseMailbox, PoseRequest
 from app.work.threads import Failure, Response, single_shot
 from lcollision_core.tasks.words import counted
@@ -38,7 +38,7 @@ RADIUS_STEP = 1.25
 
 
 @dataclass(eq=False)
-class Moving:
+class ActiveMotion:
     """The motion in progress.
 
     Attributes
@@ -57,7 +57,7 @@ class Moving:
     least_miss: float = field(default=np.inf)
     n_idle: int = 0
 
-    def leads_on(self, frame: PoseFrame) -> bool:
+    def count_frame(self, frame: PoseFrame) -> bool:
         """Count a frame; return whether the same target is worth another request."""
         self.n_idle += 1
         if frame.miss < _NEARER * self.least_miss:
@@ -169,7 +169,7 @@ class PoseMotion(QObject):
         self.locked_domains: frozenset[int] = frozenset()
         self._is_ready = self._predicts = self._is_quick = self._has_skipped = False
         self._adopted: FloatArray | None = None
-        self._moving: Moving | None = None
+        self._moving: ActiveMotion | None = None
         self._grip_radius: float | None = None
         self._last_grip: Grip | None = None
         self._grips: dict[tuple[int, float], Grip] = {}
@@ -183,7 +183,7 @@ class PoseMotion(QObject):
     # The model.
 
     def set_model(self) -> None:
-        """Follow the pose of another model, without signals: see `tell_all`."""
+        """Follow the pose of another model, without signals: see `emit_all`."""
         self.locked_domains = frozenset()
         self.frame = self._last_grip = None
         self._grips = {}
@@ -204,7 +204,7 @@ class PoseMotion(QObject):
         else:
             self._look_on()
 
-    def tell_all(self) -> None:
+    def emit_all(self) -> None:
         """Emit the change signals, as after loading another model."""
         for changed in (self.frame_changed, self.exact_changed, self.locks_changed):
             changed.emit()
@@ -526,7 +526,7 @@ class PoseMotion(QObject):
 
     def _begin(
         self, grip: Grip | Twist | None, pins: tuple[Pin, ...] = (), whole_body: bool = False
-    ) -> Moving:
+    ) -> ActiveMotion:
         from lcollision_core.posing import DragOptions
 
         options = DragOptions(
@@ -539,8 +539,8 @@ class PoseMotion(QObject):
             clearance=self.clearance if self.solid else 0.0,
         )
         pose = self._history.pose
-        start = MotionStart(pose.latent, grip, pins, options, pose.placement, self._own_space)
-        self._moving = Moving(start)
+        start = MotionStart(pose.latent, grip, pins, options, pose.placement, self._space_factory)
+        self._moving = ActiveMotion(start)
         return self._moving
 
     def _move(self, target: CodeTarget | GripTarget) -> None:
@@ -561,12 +561,12 @@ class PoseMotion(QObject):
             PoseRequest(
                 *(model, CodeTarget(pose.latent), None, self._predicts),
                 placement=pose.placement,
-                space=self._own_space,
+                space=self._space_factory,
             )
         )
 
     @property
-    def _own_space(self) -> OwnSpace | None:
+    def _space_factory(self) -> SpaceFactory | None:
         moment = self._history.state.moment
         return None if moment is None else moment.space
 
@@ -624,7 +624,7 @@ class PoseMotion(QObject):
             return
         if moving.start.grip is not None:
             # The drag no longer presses against contacts.
-            self.frame = replace(self.frame, contacts=no_points(), standing=no_points())
+            self.frame = replace(self.frame, contacts=empty_points(), standing=empty_points())
         elif not was_moving:
             return
         # Views of the target's codes show those of the pose again.
@@ -645,7 +645,7 @@ class PoseMotion(QObject):
             moving = None
         is_late, leads_on = moving is not None and self._mailbox.waiting is not None, False
         if moving is not None and frame is not None and request.target is moving.target:
-            leads_on = moving.leads_on(frame)
+            leads_on = moving.count_frame(frame)
         if leads_on:
             self._mailbox.put(request)
         # The next request is sent before the response is drawn: the worker need not wait.
@@ -735,7 +735,7 @@ class PoseMotion(QObject):
         self.exact_changed.emit()
         self._rested.start()
 
-    def _adopt(self, moving: Moving, frame: PoseFrame) -> None:
+    def _adopt(self, moving: ActiveMotion, frame: PoseFrame) -> None:
         """Make a motion's newest frame the pose."""
         history = self._history
         if frame.latent.tobytes() == history.latent.tobytes():

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from PySide6.QtCore import QLockFile, QObject, Signal, Slot
 
 from app.editing.document import PoseDocument
-from app.work.kept_motions import KEY, EditedMotions, to_keep, why_gone
+from app.work.kept_motions import KEY, EditedMotions, to_json_values, unreadable_reason
 from app.work.long_work import LongWork, Task
 from app.work.threads import Failure, guarded, single_shot
 from lcollision_core.errors import LCollisionError
@@ -71,13 +71,13 @@ class Session:
         """Make a session; raises OSError if the folder cannot be made."""
         folder = parent / uuid.uuid4().hex
         folder.mkdir(parents=True)
-        session = cls.held(folder)
+        session = cls.try_lock(folder)
         if session is None:
             raise OSError(f"{folder} cannot be locked")
         return session
 
     @classmethod
-    def held(cls, folder: Path) -> Session | None:
+    def try_lock(cls, folder: Path) -> Session | None:
         """Lock a session, or return None if a running process holds it.
 
         Also return None if its lock is not a regular file: Qt would wait for a pipe for ever.
@@ -105,7 +105,7 @@ class Session:
 
 
 @dataclass(frozen=True, eq=False)
-class LostPose:
+class RecoverablePose:
     """The unsaved pose of an editor that crashed.
 
     Attributes
@@ -133,9 +133,9 @@ class LostPose:
     motion_stamp: FileStamp | None = None
 
     @property
-    def why_pose_alone(self) -> str:
+    def motion_loss_reason(self) -> str:
         """Why the edits of its motion cannot be restored; "" if they can."""
-        return why_gone(self.motion_file, self.motion_stamp) if self.motion_file else ""
+        return unreadable_reason(self.motion_file, self.motion_stamp) if self.motion_file else ""
 
     @property
     def model_name(self) -> str:
@@ -148,7 +148,7 @@ class LostPose:
         return self.session.folder / _POSES
 
 
-def find_lost_poses(parent: Path | None = None) -> list[LostPose]:
+def find_recoverable_poses(parent: Path | None = None) -> list[RecoverablePose]:
     """Find and lock the sessions of editors that no longer run, newest first.
 
     Sessions without a pose are deleted.
@@ -160,12 +160,12 @@ def find_lost_poses(parent: Path | None = None) -> list[LostPose]:
     parent = parent or sessions_folder()
     lost_poses = []
     for folder in parent.iterdir() if parent.is_dir() else ():
-        session = Session.held(folder) if folder.is_dir() else None
+        session = Session.try_lock(folder) if folder.is_dir() else None
         if session is None:
             continue
         try:
             description = parse_json(read_regular(folder / _SESSION, _MAX_SESSION_BYTES))
-            lost = LostPose(
+            lost = RecoverablePose(
                 session=session,
                 model=str(description["model"]),
                 pose_name=str(description["pose_name"]),
@@ -215,7 +215,7 @@ class Autosave(QObject):
         super().__init__(document)
         self._document = document
         self._told = False
-        self._recovering: LostPose | None = None
+        self._recovering: RecoverablePose | None = None
         self._session: Session | None = None
         try:
             self._session = Session.new(parent_folder or sessions_folder())
@@ -237,7 +237,7 @@ class Autosave(QObject):
         document.history.modified_changed.connect(self._on_modified_changed)
         document.tasks.recovered.connect(self._on_recovered)
 
-    def recover(self, lost: LostPose) -> None:
+    def recover(self, lost: RecoverablePose) -> None:
         """Load a lost pose into the document, unsaved, and continue its session.
 
         If its model is gone, emit `PoseDocument.failed` and leave the session unchanged.
@@ -362,7 +362,7 @@ def _write(
     too_large = None
     if motions is not None:
         try:
-            extra = {KEY: to_keep(motions)}
+            extra = {KEY: to_json_values(motions)}
             file_of, stamp = str(motions.file.absolute()), motions.stamp
             session |= {"motion": motions.open, "motion_file": file_of, "motion_stamp": stamp}
         except LCollisionError as error:

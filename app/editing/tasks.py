@@ -16,7 +16,7 @@ from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
 
 from app.editing.history import Source, named_after, read_only
 from app.work.kept_motions import EditedMotions, read_lost
-from app.work.long_work import LongWork, Task, unwatched
+from app.work.long_work import LongWork, Task, as_task
 from app.work.preparing import open_poses_to_show, open_to_show, prepare, ready
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
@@ -310,7 +310,7 @@ class Tasks(QObject):
         read : the file's contents if it was already read
         """
         work = partial(open_to_show, name_or_path, read=read)
-        self.bring(f"Opening {Path(name_or_path).name}", work, self._on_model)
+        self.start_loading(f"Opening {Path(name_or_path).name}", work, self._on_model)
 
     def turn_upright(self) -> None:
         """Make the next axis the up axis, stored in a model's own file, and reopen the body."""
@@ -320,7 +320,7 @@ class Tasks(QObject):
         def turn(job: Job) -> OpenedModel:
             return ready(OpenedModel(changing.set_up_axis(body, file, axis), file), job)
 
-        self.bring(f"Turning {body.name}", turn, self._on_model)
+        self.start_loading(f"Turning {body.name}", turn, self._on_model)
 
     def set_joint_role(self, joint: str, role: str | None) -> None:
         """Set the role of a character's joint, None for that of its rig, and reopen it."""
@@ -330,7 +330,7 @@ class Tasks(QObject):
             changing.set_joint_roles(body, {joint: role})
             return open_to_show(file, job, body.character)
 
-        self.bring(f"Opening {body.name}", set_role, self._on_model)
+        self.start_loading(f"Opening {body.name}", set_role, self._on_model)
 
     @property
     def _model(self) -> Body:
@@ -368,12 +368,12 @@ class Tasks(QObject):
         ----------
         edits : the changes, and the name of the copy if the model's own file stays unchanged
         """
-        job = unwatched(changing.edit_parts, self._model, self._history.model_file, edits)
+        job = as_task(changing.edit_parts, self._model, self._history.model_file, edits)
         self.start(Work.CHANGE_MODEL, "Saving the body parts", job, self._on_parts)
 
     def count_contacts(self) -> None:
         """Count the pairs of the rest pose by contact rule, for `contacts_counted`."""
-        job = unwatched(changing.contacts_at_rest, self._model)
+        job = as_task(changing.contacts_at_rest, self._model)
         done = self.contacts_counted.emit
         self.start(Work.COUNT_CONTACTS, "Counting pairs at rest", job, done)
 
@@ -389,7 +389,7 @@ class Tasks(QObject):
         The pose, its history and the locks stay; the change cannot be undone. `told` is the
         message once the rules apply.
         """
-        job = unwatched(changing.set_rules, self._model, self._history.model_file, rules)
+        job = as_task(changing.set_rules, self._model, self._history.model_file, rules)
         done = partial(self._on_rules, told)
         self.start(Work.CHANGE_MODEL, "Applying the contact rules", job, done)
 
@@ -405,13 +405,13 @@ class Tasks(QObject):
         """
         body = None if model_file else self._model
         work = partial(open_poses_to_show, body, model_file or "", Path(path))
-        self.bring(f"Opening {Path(path).name}", work, self._on_poses)
+        self.start_loading(f"Opening {Path(path).name}", work, self._on_poses)
 
     def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
-        """Restore the pose that a crash left, see `LostPose`, unsaved."""
+        """Restore the pose that a crash left, see `RecoverablePose`, unsaved."""
         model = self._model if model_file == self._history.model_file else None
         work = partial(read_lost, model, model_file, poses_file)
-        self.bring(f"Recovering {name}", work, partial(self._on_recovered, name, file))
+        self.start_loading(f"Recovering {name}", work, partial(self._on_recovered, name, file))
 
     def save(self, path: str | Path | None = None) -> None:
         """Write the working pose and the file's other poses, and mark the pose as saved.
@@ -431,16 +431,16 @@ class Tasks(QObject):
         target = Path(path) if path is not None else history.file
         if target is None:
             raise ModelFileError("the pose has no file yet", "save it under a name")
-        asked_pose, opened = history.pose, history.opened
+        asked_pose, document_token = history.pose, history.document_token
 
         def done(stamp: FileStamp | None) -> str:
-            if history.opened is opened:
+            if history.document_token is document_token:
                 history.file_stamp = stamp
-                history.keep_saved(asked_pose, pose, target)
+                history.mark_saved_as(asked_pose, pose, target)
             return f"Saved {target.name}"
 
         pose = named_after(asked_pose, target)
-        job = unwatched(save_poses, target, self._model, history.file_poses, pose)
+        job = as_task(save_poses, target, self._model, history.file_poses, pose)
         self.save_file(target, job, done)
 
     def save_file(self, path: Path, job: Task, done: Callable[[Any], str]) -> None:
@@ -476,7 +476,7 @@ class Tasks(QObject):
         is_asked_as_mesh : the user chose it as a mesh of this model; else it may be any file
         """
         work = partial(import_mesh, self._model, Path(path), scale, is_asked_as_mesh)
-        self.bring(
+        self.start_loading(
             f"Importing {Path(path).name}", work, partial(self._on_encoded, Path(path)), ask=False
         )
 
@@ -609,7 +609,7 @@ class Tasks(QObject):
         self._history.begin_with(edited, Source.FILE, file, poses)
         # Unknown, so that Save asks, until the session gives it.
         self._history.file_stamp = None
-        self._history.keep_unsaved()
+        self._history.mark_unsaved()
         is_whole = not isinstance(motions, Failure)
         self.recovered.emit(read.path, motions if is_whole else None)
         self.message.emit(f"Recovered {edited.name}")
@@ -711,10 +711,12 @@ class Tasks(QObject):
         self.offers_rules = False
         from lcollision_core.bodies.known import remember_offer_declined
 
-        job = unwatched(remember_offer_declined, self._model)
+        job = as_task(remember_offer_declined, self._model)
         self.start(Work.PROPOSE_RULES, "Keeping the answer", job, lambda _: None)
 
-    def bring(self, label: str, work: Task, done: Callable[[Any], None], ask: bool = True) -> None:
+    def start_loading(
+        self, label: str, work: Task, done: Callable[[Any], None], ask: bool = True
+    ) -> None:
         """Start work that replaces the pose; it cancels earlier requests and a Resolve.
 
         With `ask`, ask before it replaces later edits, which undo could not restore.

@@ -240,7 +240,7 @@ class MotionResolve(QObject):
         """Whether the Resolve was asked to stop: see `keep_done`."""
         return self._stop.cancelled
 
-    def told_of(self, found: ResolvedMotion, part_names: Sequence[str]) -> str:
+    def summary(self, found: ResolvedMotion, part_names: Sequence[str]) -> str:
         """Summarise a result in one sentence."""
         if self.is_ending and not found.spans:
             return "Stopped before a span of frames was resolved: the motion is as it was"
@@ -423,7 +423,7 @@ class Timeline(QObject):
         path : see `read_motions`
         """
         job = partial(open_motions_to_show, self._history.model, Path(path))
-        self._tasks.bring(f"Opening {Path(path).name}", job, partial(self._on_read, path))
+        self._tasks.start_loading(f"Opening {Path(path).name}", job, partial(self._on_read, path))
 
     def choose(self, name: str, enters: bool = True) -> None:
         """Put another motion on the timeline once it is read; with `enters`, go to frame 0."""
@@ -584,7 +584,7 @@ class Timeline(QObject):
             history.push("Go to the motion", state)
         else:
             history.apply(state)
-        history.tell_modified()
+        history.update_modified()
 
     def _want(self, motion: Motion, frame: int, ahead: int = 1) -> None:
         """Request frames, the most urgent first."""
@@ -780,7 +780,7 @@ class Timeline(QObject):
         self._edited = dict(lost.edited)
         self._saved = {name: lost.edited[name] for name in lost.saved}
         motion, pose = lost.edited[lost.open], self._history.pose
-        state = self.settled(DocumentState(pose, moment=Moment(motion, lost.frame)))
+        state = self.with_motion_edit(DocumentState(pose, moment=Moment(motion, lost.frame)))
         self._put(lost.read[lost.open], state)
         self._want(state.motion or motion, lost.frame)
 
@@ -788,9 +788,9 @@ class Timeline(QObject):
         """Mark motions as saved, all if None."""
         saved = self._edited.values() if exported is None else exported
         self._saved |= {motion.name: motion for motion in saved}
-        self._history.tell_modified()
+        self._history.update_modified()
 
-    def settled(self, state: DocumentState) -> DocumentState:
+    def with_motion_edit(self, state: DocumentState) -> DocumentState:
         """Turn an edit of a frame into a correction of its motion: see `MotionEdits`."""
         from lcollision_core.motion.motion import corrected
 
@@ -942,7 +942,7 @@ class Timeline(QObject):
             # Resolve has checked these frames exactly.
             self.checks.deepest[found.after & np.isnan(self.checks.deepest)] = 0.0
             self.checked.emit()
-        self.message.emit(self.resolving.told_of(found, history.model.domain_names))
+        self.message.emit(self.resolving.summary(found, history.model.domain_names))
 
     def close(self, deadline: float) -> bool:
         """Stop all work and end the threads; see `LongWork.close`."""

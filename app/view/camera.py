@@ -106,7 +106,7 @@ def sees_all(view: View, vertices: npt.NDArray[Any], aspect: float) -> bool:
     return bool((needed + depth <= distance).all())
 
 
-def kept_in_view(
+def reframed_if_out_of_view(
     view: View, before: npt.NDArray[Any], after: npt.NDArray[Any], aspect: float
 ) -> View | None:
     """Frame the whole mesh from the same side if a change of pose moved it out of view.
@@ -212,10 +212,10 @@ def shifted(view: View, start: Pixel, end: Pixel, size: Pixel) -> View:
 
     Parameters
     ----------
-    start, end : positions of the pointer; see `seen_at`
+    start, end : positions of the pointer; see `unproject`
     size : of the image
     """
-    motion = seen_at(view, start, size, view.focus) - seen_at(view, end, size, view.focus)
+    motion = unproject(view, start, size, view.focus) - unproject(view, end, size, view.focus)
     return View(view.position + motion, view.focus + motion, view.up)
 
 
@@ -241,17 +241,17 @@ def turn_about(axis: FloatArray, view: View) -> FloatArray:
     return direction
 
 
-def seen_at(view: View, place: Pixel, size: Pixel, deep_as: FloatArray) -> FloatArray:
+def unproject(view: View, place: Pixel, size: Pixel, at_depth_of: FloatArray) -> FloatArray:
     """Return the (3,) point at an image position, at the depth of another point.
 
     Parameters
     ----------
     place : in pixels from the left and top of the image
     size : width and height of the image, in the same pixels
-    deep_as : (3,) array, in the data's unit
+    at_depth_of : (3,) array, in the data's unit
     """
     axes = _axes(view)
-    depth = float((deep_as - view.position) @ axes[2])
+    depth = float((at_depth_of - view.position) @ axes[2])
     pixel = _pixel(depth, size[1])
     away = np.array([place[0] - 0.5 * size[0], 0.5 * size[1] - place[1]]) * pixel
     point: FloatArray = view.position + away @ axes[:2] + depth * axes[2]
@@ -294,7 +294,7 @@ def _pixel(depth: Any, height: float) -> Any:
     return 2.0 * depth * np.tan(np.radians(0.5 * VIEW_ANGLE)) / height
 
 
-def between(start: View, end: View, fraction: float) -> View:
+def interpolated(start: View, end: View, fraction: float) -> View:
     """Interpolate two cameras on an arc round their focus.
 
     Parameters
@@ -332,7 +332,7 @@ _LEAST_SEEN = 0.05
 """Lower bound of the squared sine of the angle between an axis and the line of sight."""
 
 
-class DragDepth:
+class DragTarget:
     """Find the 3D target of a drag from an image position.
 
     The target is at the depth of the grabbed point, but in front of the rest of the body where
@@ -342,10 +342,10 @@ class DragDepth:
     Parameters
     ----------
     view, size : camera and size of the image, fixed during the drag
-    taken : (3,) point that was grabbed
+    grabbed_point : (3,) point that was grabbed
     vertices : (V, 3) array, as the drag begins
     faces : (F, 3) array, of the mesh
-    moving : (V,) bool array, the vertices that follow the pointer and cannot obstruct it
+    moving_vertices : (V,) bool array, the vertices that follow the pointer and cannot obstruct it
     body_size : in the data's unit
     """
 
@@ -353,15 +353,15 @@ class DragDepth:
         self,
         view: View,
         size: Pixel,
-        taken: FloatArray,
+        grabbed_point: FloatArray,
         vertices: npt.NDArray[np.floating],
         faces: npt.NDArray[np.integer],
-        moving: npt.NDArray[np.bool_],
+        moving_vertices: npt.NDArray[np.bool_],
         body_size: float,
     ) -> None:
-        self._view, self._size, self._plane = view, size, taken
+        self._view, self._size, self._plane = view, size, grabbed_point
         self._snaps = True
-        moves = moving[faces]
+        moves = moving_vertices[faces]
         self._wide = _WIDE * body_size
         self._corners = vertices[faces[~moves.any(axis=1)]].astype(np.float64)
         places = places_of(view, self._corners.reshape(-1, 3), size).reshape(-1, 3, 2)
@@ -370,17 +370,17 @@ class DragDepth:
         middles = self._corners.mean(axis=1)
         used = np.unique(faces[~moves.any(axis=1)])
         self._points = np.concatenate([vertices[used].astype(np.float64), middles])
-        away = taken - view.position
+        away = grabbed_point - view.position
         distances = _distances(view.position, away, vertices[faces[moves.all(axis=1)]])
         # The far side of the grabbed limb rests on the surface: find its thickness.
         behind = distances[distances > 1.0] * np.linalg.norm(away)
         thick = float(behind.min(initial=np.inf) - np.linalg.norm(away))
         self._thickness = (thick if thick < _MOST_THICK * body_size else 0.0) + _CLEAR * body_size
 
-    def point(self, place: Pixel) -> FloatArray:
+    def target(self, place: Pixel) -> FloatArray:
         """Return the (3,) target for an image position."""
         view = self._view
-        there = seen_at(view, place, self._size, self._plane)
+        there = unproject(view, place, self._size, self._plane)
         if not self._snaps:
             return there
         way = there - view.position
@@ -401,7 +401,7 @@ class DragDepth:
     def shift(self, place: Pixel, by: float) -> None:
         """Move the target at an image position away from the viewer, and keep that depth."""
         forward = self._view.focus - self._view.position
-        self._plane = self.point(place) + by * forward / np.linalg.norm(forward)
+        self._plane = self.target(place) + by * forward / np.linalg.norm(forward)
         self._snaps = False
 
 
@@ -441,7 +441,7 @@ def along_axis(
     origin, axis : (3,) point and unit vector; an axis along the line of sight is treated as if it
         were seen slightly from the side
     """
-    ray = seen_at(view, place, size, origin) - view.position
+    ray = unproject(view, place, size, origin) - view.position
     ray /= np.linalg.norm(ray)
     offset, slant = view.position - origin, float(axis @ ray)
     return float((axis @ offset - slant * (ray @ offset)) / max(1.0 - slant**2, _LEAST_SEEN))

@@ -25,15 +25,15 @@ from vtkmodules.vtkRenderingCore import vtkActor, vtkCellPicker
 
 from app.editing.live_pose import RADIUS_STEP, domain_of, part_name
 from app.view.camera import (
-    DragDepth,
+    DragTarget,
     Pixel,
     View,
     along_axis,
     pixel_length,
-    seen_at,
     shifted,
     turn_about,
     turned,
+    unproject,
     zoomed,
 )
 
@@ -173,7 +173,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self._rest.start()
         self.update()
 
-    def look_again(self) -> None:
+    def rehover(self) -> None:
         """Signal the pointer's position again, after a short delay."""
         if not self._shut:
             self._hover.start()
@@ -381,7 +381,7 @@ _HINTS = (
 )
 """Hints shown while the body is dragged."""
 
-_CALL_HELP = "begin with Ctrl+Shift: the whole body helps"
+_WHOLE_BODY_HINT = "begin with Ctrl+Shift: the whole body helps"
 
 _Drag = Callable[[QPointF], None]
 
@@ -456,19 +456,19 @@ class Mouse(QObject):
     pin : index of the pin under the pointer, or None
     handle : the body part whose handle is under the pointer, or None
     arrows : vertex whose patch has arrows to drag, or None
-    helped : whether the whole body helps in the current drag
+    whole_body_drag : whether the whole body helps in the current drag
 
     Signals
     -------
     pointed : QPointF in the canvas, the pointer, or None; `vertex` or `pin` may have changed
-    helped_at : QPointF in the canvas, the pointer in a drag in which the whole body helps
+    whole_body_dragged : QPointF in the canvas, the pointer in a drag in which the whole body helps
     hinted : str, hint for the current drag; "" as it ends
     camera_moved : View, the requested camera
     redraw_wanted : the patch or the lines have changed
     """
 
     pointed = Signal(object)
-    helped_at = Signal(object)
+    whole_body_dragged = Signal(object)
     hinted = Signal(str)
     camera_moved = Signal(object)
     redraw_wanted = Signal()
@@ -486,7 +486,7 @@ class Mouse(QObject):
         self.handle: int | None = None
         self._handles: list[Handle] = []
         self.arrows: int | None = None
-        self.helped = False
+        self.whole_body_drag = False
         self._last_vertex: int | None = None
         self._keeps = False
         self._drag: _Drag | None = None
@@ -504,7 +504,7 @@ class Mouse(QObject):
         document.motion.grip_radius_changed.connect(self._show_patch)
         document.history.pins_changed.connect(self.redraw_wanted)
 
-    def let_go(self) -> None:
+    def reset(self) -> None:
         """Forget the pointed vertex and the drag, as for another model."""
         self._forget_drag()
         self.arrows = None
@@ -514,7 +514,7 @@ class Mouse(QObject):
 
     def _forget_drag(self) -> None:
         self._drag = self._grip = self._target = self._deepen = None
-        self.helped = False
+        self.whole_body_drag = False
 
     def point_at(self, place: QPointF | None) -> None:
         """Find the pin, handle or vertex under the pointer, and show the patch of a drag."""
@@ -546,17 +546,17 @@ class Mouse(QObject):
         self.pointed.emit(place)
 
     def keep_patch(self) -> None:
-        """Keep pointing at the last patch until `look_again`."""
+        """Keep pointing at the last patch until `rehover`."""
         self._keeps = True
         if self.vertex is None and self._last_vertex is not None:
             self.vertex = self._last_vertex
             self._show_patch()
             self.pointed.emit(None)
 
-    def look_again(self) -> None:
+    def rehover(self) -> None:
         """Update what is under the pointer, after a short delay."""
         self._keeps = False
-        self._canvas.look_again()
+        self._canvas.rehover()
 
     def toggle_pin(self, oriented: bool = False) -> None:
         """Pin the patch under the pointer, optionally with its orientation, or unpin it."""
@@ -679,23 +679,23 @@ class Mouse(QObject):
         if scene is None:
             return
         modifier = Qt.KeyboardModifier
-        helped = bool(keys & modifier.ControlModifier and keys & modifier.ShiftModifier)
+        whole_body = bool(keys & modifier.ControlModifier and keys & modifier.ShiftModifier)
         left = button is Qt.MouseButton.LeftButton
         axis = scene.marks.arrow_at(_pixel(start), scene.view, self._size) if left else None
         if button is Qt.MouseButton.RightButton:
             self._drag = self._zooming(start)
         elif axis is not None and self.arrows is not None:
             self._drag = self._moving_along(scene, start, self.arrows, self._axes[axis])
-        elif keys & modifier.ShiftModifier and not helped:
+        elif keys & modifier.ShiftModifier and not whole_body:
             self._drag = self._shifting(start)
         elif left and not keys & modifier.AltModifier:
             self.point_at(start)
             if self.vertex is None:
                 self._drag = self._turning(start)
-            elif keys & modifier.ControlModifier and not helped and self.pin is None:
+            elif keys & modifier.ControlModifier and not whole_body and self.pin is None:
                 self._drag = self._twisting(scene, start, self.vertex)
             else:
-                self._drag = self._moving(scene, start, self.vertex, helped)
+                self._drag = self._moving(scene, start, self.vertex, whole_body)
         else:
             self._drag = self._turning(start)
         # Hide a patch that is not dragged: it would cover what the user looks at.
@@ -706,8 +706,8 @@ class Mouse(QObject):
     def _on_dragged(self, place: QPointF) -> None:
         if self._drag is not None:
             self._drag(place)
-        if self.helped and self._document.motion.dragging:
-            self.helped_at.emit(place)
+        if self.whole_body_drag and self._document.motion.dragging:
+            self.whole_body_dragged.emit(place)
 
     @Slot(bool)
     def _on_drag_ended(self, escaped: bool) -> None:
@@ -737,13 +737,13 @@ class Mouse(QObject):
                 grip, f"Drag {part_name(document.model, vertex)}", whole_body
             )
         self._grip = grip
-        self.helped = whole_body or document.motion.whole_body
-        self.hinted.emit(" · ".join((*_HINTS, *(_CALL_HELP,) * (not self.helped))))
+        self.whole_body_drag = whole_body or document.motion.whole_body
+        self.hinted.emit(" · ".join((*_HINTS, *(_WHOLE_BODY_HINT,) * (not self.whole_body_drag))))
         self._canvas.setCursor(Qt.CursorShape.ClosedHandCursor)
         limbs = document.model.space.limbs
         moving = limbs.carried(limbs.holding(grip.vertices, grip.weights), 2.0 * grip.radius)
         body_size = document.model.body_size
-        depth = DragDepth(
+        drag_target = DragTarget(
             scene.view,
             self._size,
             grip_position,
@@ -752,15 +752,15 @@ class Mouse(QObject):
             moving,
             body_size,
         )
-        offset = home - depth.point(_pixel(start))
+        offset = home - drag_target.target(_pixel(start))
         places = [start]
 
         def move(place: QPointF) -> None:
             places[0] = place
-            self._aim(lambda: depth.point(_pixel(place)) + offset)
+            self._aim(lambda: drag_target.target(_pixel(place)) + offset)
 
         def deepen(notches: float) -> None:
-            depth.shift(_pixel(places[0]), notches * _DEPTH_PER_NOTCH * body_size)
+            drag_target.shift(_pixel(places[0]), notches * _DEPTH_PER_NOTCH * body_size)
             move(places[0])
 
         self._deepen = deepen
@@ -862,7 +862,7 @@ class Mouse(QObject):
         anchor = self._zoom_anchor
         if anchor is None or anchor[0] != place or now - anchor[2] > _ZOOM_SECONDS:
             picked = self._canvas.pick(place, scene.body)
-            beside = seen_at(view, _pixel(place), self._size, view.focus)
+            beside = unproject(view, _pixel(place), self._size, view.focus)
             point = beside if picked is None else picked[1]
         else:
             point = anchor[1]

@@ -13,7 +13,7 @@ from vtkmodules.vtkRenderingCore import vtkActor2D, vtkPolyDataMapper2D
 
 from app.view.camera import VIEW_ANGLE, Pixel, View, pixel_length, places_of
 from app.view.shading import CONTACT, rgb
-from app.view.surface import Surface, actor_of
+from app.view.surface import Surface, make_actor
 
 if TYPE_CHECKING:
     from vtkmodules.vtkRenderingCore import vtkRenderer
@@ -131,15 +131,15 @@ class Marks:
         """Return the index of the handle at an image position, or None."""
         return _dot_at(self.handles, place, view, size)
 
-    def fit(self, view: View, sharpness: float) -> None:
+    def fit(self, view: View, device_pixel_ratio: float) -> None:
         """Build the shapes for the camera, just before a picture.
 
         Parameters
         ----------
-        sharpness : device pixel ratio
+        device_pixel_ratio : physical pixels per device-independent pixel
         """
         width, height = self._renderer.GetSize()
-        size = width / sharpness, height / sharpness
+        size = width / device_pixel_ratio, height / device_pixel_ratio
         shapes: list[tuple[FloatArray, str]] = []
         if self._line is not None:
             shapes += self._target_shapes(self._line, view, size)
@@ -166,7 +166,7 @@ class Marks:
         corners = np.concatenate([quads for quads, _ in shapes])
         corners[:, :, 1] = size[1] - corners[:, :, 1]
         flat = np.zeros((4 * len(corners), 3), dtype=np.float32)
-        flat[:, :2] = corners.reshape(-1, 2) * sharpness
+        flat[:, :2] = corners.reshape(-1, 2) * device_pixel_ratio
         self._flat.points = flat
         self._flat.SetPolys(pv.CellArray.from_regular_cells(np.arange(len(flat)).reshape(-1, 4)))
         paint = np.repeat([rgb(c) for _, c in shapes], [len(q) for q, _ in shapes], axis=0)
@@ -297,12 +297,12 @@ class MotionMarks:
             self._path = None
         if points is not None and len(points) > 1:
             line = pv.lines_from_points(points.astype(np.float32))
-            self._path = actor_of(line, lighting=False, line_width=2.5, color=self._theme.accent)
+            self._path = make_actor(line, lighting=False, line_width=2.5, color=self._theme.accent)
             self._renderer.AddActor(self._path)
 
     def _new_skin(self) -> tuple[Surface, pv.Actor]:
         surface = Surface(self._model.faces, self._model.n_vertices)
-        actor = actor_of(surface.polydata, ambient=0.5, diffuse=0.6, culling="back")
+        actor = make_actor(surface.polydata, ambient=0.5, diffuse=0.6, culling="back")
         actor.ForceTranslucentOn()
         self._renderer.AddActor(actor)
         return surface, actor
@@ -325,8 +325,8 @@ class FaceHighlight:
     Attributes
     ----------
     hidden : (F,) bool array, the faces that are not drawn; None for none
-    nearer, through : actors to be added to a renderer; the second shows occluded faces, on the far
-        side or inside a limb, translucently through the body
+    visible_actor, occluded_actor : actors to be added to a renderer; the second shows occluded
+        faces, on the far side or inside a limb, translucently through the body
     """
 
     def __init__(
@@ -336,14 +336,14 @@ class FaceHighlight:
         self.hidden: npt.NDArray[np.bool_] | None = None
         self._polydata = pv.PolyData()
         self._polydata.SetPoints(surface.polydata.GetPoints())
-        self.nearer = actor_of(self._polydata, color=colour, ambient=0.55, diffuse=0.5)
-        self.through = actor_of(
+        self.visible_actor = make_actor(self._polydata, color=colour, ambient=0.55, diffuse=0.5)
+        self.occluded_actor = make_actor(
             self._polydata, color=colour, opacity=_THROUGH_OPACITY, lighting=False
         )
         # The body has the same triangles: without an offset, rounding decides which are visible.
         for actor, offset in (
-            (self.nearer, (-1.0 * layer, -2.0 * layer)),
-            (self.through, (0.0, _TO_THE_FRONT)),
+            (self.visible_actor, (-1.0 * layer, -2.0 * layer)),
+            (self.occluded_actor, (0.0, _TO_THE_FRONT)),
         ):
             actor.mapper.SetResolveCoincidentTopologyToPolygonOffset()
             actor.mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(*offset)
@@ -358,7 +358,7 @@ class FaceHighlight:
             self._polydata.SetPolys(pv.CellArray.from_regular_cells(self._faces[face_numbers]))
         self._set_visible(len(face_numbers) > 0)
 
-    def look_like(self, other: FaceHighlight) -> None:
+    def copy_from(self, other: FaceHighlight) -> None:
         """Show the faces of another highlight of the same mesh."""
         self._polydata.SetPolys(other._polydata.GetPolys())
         self._set_visible(other.n_faces > 0)
@@ -366,10 +366,10 @@ class FaceHighlight:
     @property
     def n_faces(self) -> int:
         """Number of faces drawn."""
-        return int(self._polydata.GetNumberOfPolys()) if self.nearer.GetVisibility() else 0
+        return int(self._polydata.GetNumberOfPolys()) if self.visible_actor.GetVisibility() else 0
 
     def _set_visible(self, visible: bool) -> None:
-        for actor in (self.nearer, self.through):
+        for actor in (self.visible_actor, self.occluded_actor):
             actor.SetVisibility(visible)
 
 
@@ -467,9 +467,9 @@ class Outline:
         self._strokes = []
         for width, colour, nearer in _STROKES:
             border, shell = pv.PolyData(), pv.PolyData()
-            line = actor_of(border, color=colour, lighting=False)
+            line = make_actor(border, color=colour, lighting=False)
             # Cull front faces: only the far side shows, beside the part.
-            rim = actor_of(shell, color=colour, lighting=False, culling="front")
+            rim = make_actor(shell, color=colour, lighting=False, culling="front")
             for actor in (line, rim):
                 actor.SetVisibility(False)
                 renderer.AddActor(actor)
@@ -492,13 +492,13 @@ class Outline:
             for actor in actors:
                 actor.SetVisibility(shape is not None)
 
-    def fit(self, vertices: Float32Array, normals: Float32Array, sharpness: float) -> None:
+    def fit(self, vertices: Float32Array, normals: Float32Array, device_pixel_ratio: float) -> None:
         """Fit the outline to the pose and the camera.
 
         Parameters
         ----------
         vertices, normals : (V, 3) float32 arrays
-        sharpness : device pixel ratio
+        device_pixel_ratio : physical pixels per device-independent pixel
         """
         shape = self._shape
         if shape is None:
@@ -508,12 +508,12 @@ class Outline:
         eye = np.array(self._renderer.GetActiveCamera().GetPosition(), dtype=np.float32)
         middle = np.concatenate([border, skin]).mean(axis=0)
         distance = float(np.linalg.norm(eye - middle))
-        n_pixels = max(1, self._renderer.GetSize()[1]) / sharpness
+        n_pixels = max(1, self._renderer.GetSize()[1]) / device_pixel_ratio
         pixel = 2.0 * distance * np.tan(np.radians(0.5 * VIEW_ANGLE)) / n_pixels
         for width, nearer, lines, shell, line, _ in self._strokes:
             lines.points = border + np.float32(nearer * pixel / distance) * (eye - border)
             shell.points = skin + np.float32(width * pixel) * outward
-            line.prop.line_width = _BORDER_WIDTH * width * sharpness
+            line.prop.line_width = _BORDER_WIDTH * width * device_pixel_ratio
 
 
 def _smooth(values: npt.NDArray[np.float64], faces: npt.NDArray[Any]) -> npt.NDArray[np.float64]:

@@ -92,10 +92,10 @@ class PoseRenderer:
 
     def drawn(self) -> Image:
         """Render the current scene, in RGBA if `transparent`, else in RGB."""
-        return picture_of(self.pixels())
+        return to_image(self.pixels())
 
     def pixels(self) -> UInt8Array:
-        """Render the current scene, (H, W, C), for `picture_of` in any thread."""
+        """Render the current scene, (H, W, C), for `to_image` in any thread."""
         # Otherwise pyvista returns the previous picture.
         self._plotter.render()
         return np.array(
@@ -107,7 +107,7 @@ class PoseRenderer:
         self._plotter.close()
 
 
-def picture_of(pixels: UInt8Array) -> Image:
+def to_image(pixels: UInt8Array) -> Image:
     """Return a picture of `PoseRenderer.pixels`, which may be changed in place."""
     from PIL import Image
 
@@ -144,7 +144,7 @@ _MOST_BYTES = 2**31
 
 
 @dataclass(frozen=True)
-class TurntableStyle:
+class VideoStyle:
     """The style of a video.
 
     Attributes
@@ -177,7 +177,7 @@ class TurntableStyle:
         ends = np.arange(self.n_frames + 1) * (1000.0 / self.rate / unit)
         return [int(unit * step) for step in np.diff(np.round(ends))]
 
-    def refusal(self, path: Path) -> MeshFileError | None:
+    def why_not_writable(self, path: Path) -> MeshFileError | None:
         """Return an error that says why a video of this style cannot be written, or None."""
         suffix = path.suffix.lower()
         where: str | Path = path.name
@@ -211,7 +211,7 @@ class TurntableVideo:
     style : of the video; the renderer has its size and background
     """
 
-    def __init__(self, renderer: PoseRenderer, path: Path, style: TurntableStyle) -> None:
+    def __init__(self, renderer: PoseRenderer, path: Path, style: VideoStyle) -> None:
         self._renderer = renderer
         self._style = style
         self._format = path.suffix[1:].upper()
@@ -262,7 +262,7 @@ class TurntableVideo:
         incomplete = CancelledError("the video is incomplete")
         self._unfinished.__exit__(CancelledError, incomplete, None)
 
-    def pack(self, job: Job) -> str:
+    def encode(self, job: Job) -> str:
         """Write the video once all frames are drawn, and return a message; runs as a job."""
         from lcollision_core.files import atomic_write
 
@@ -297,7 +297,7 @@ class MotionVideo(TurntableVideo):
         self,
         renderer: PoseRenderer,
         path: Path,
-        style: TurntableStyle,
+        style: VideoStyle,
         model: Body,
         motion: Motion,
         follows: bool = False,

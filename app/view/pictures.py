@@ -13,11 +13,11 @@ from PySide6.QtCore import QObject, QTimer, Signal, Slot
 from app.view.offscreen import (
     MotionVideo,
     PoseRenderer,
-    TurntableStyle,
     TurntableVideo,
     UInt8Array,
-    picture_of,
+    VideoStyle,
     save_png,
+    to_image,
 )
 from app.view.theme import current_theme
 from app.work.threads import guarded
@@ -97,7 +97,7 @@ class Pictures(QObject):
             renderer.close()
         self._document.tasks.write(f"Saving {path.name}", partial(_save, pixels, path))
 
-    def turntable(self, path: str | os.PathLike[str], style: TurntableStyle) -> None:
+    def turntable(self, path: str | os.PathLike[str], style: VideoStyle) -> None:
         """Start a video of one full turn round the body, replacing one that is being drawn.
 
         The document emits a message once it is saved.
@@ -118,7 +118,7 @@ class Pictures(QObject):
     def motion(
         self,
         path: str | os.PathLike[str],
-        style: TurntableStyle,
+        style: VideoStyle,
         motion: Motion,
         follows: bool = False,
     ) -> None:
@@ -132,9 +132,9 @@ class Pictures(QObject):
         self._film(Path(path), style, motion, follows)
 
     def _film(
-        self, path: Path, style: TurntableStyle, motion: Motion | None, follows: bool = False
+        self, path: Path, style: VideoStyle, motion: Motion | None, follows: bool = False
     ) -> None:
-        refusal = style.refusal(path)
+        refusal = style.why_not_writable(path)
         if refusal is not None:
             raise refusal
         self.cancel()
@@ -171,7 +171,7 @@ class Pictures(QObject):
     def _copy(self, width: int, height: int, transparent: bool) -> PoseRenderer:
         scene = self._scene_now()
         renderer = PoseRenderer(self._document.model, width, height, current_theme(), transparent)
-        renderer.scene.look_like(scene)
+        renderer.scene.copy_from(scene)
         return renderer
 
     @Slot()
@@ -186,10 +186,10 @@ class Pictures(QObject):
         self._document.message.emit(f"Video: frame {video.n_drawn} of {video.n_frames}")
         if video.n_drawn == video.n_frames:
             # Start writing before drawing ends: a closing window waits while either is busy.
-            self._document.tasks.write(label, video.pack)
+            self._document.tasks.write(label, video.encode)
             self._end().close()
 
 
 def _save(pixels: UInt8Array, path: Path, _: Job) -> str:
-    save_png(picture_of(pixels), path)
+    save_png(to_image(pixels), path)
     return f"Saved {path.name}"

@@ -11,7 +11,7 @@ import pyvista as pv
 from app.view.camera import VIEW_ANGLE, View
 from app.view.marks import FaceHighlight, Marks, MotionMarks, Outline, PartShape
 from app.view.shading import COLLIDING_FACE, NAMED_FACE, UNCOUNTED_FACE
-from app.view.surface import Patch, Surface, TexturedBody, actor_of, body_actor
+from app.view.surface import Patch, Surface, TexturedBody, body_actor, make_actor
 
 if TYPE_CHECKING:
     from app.view.shading import Theme
@@ -37,7 +37,7 @@ class Scene:
     Attributes
     ----------
     crossing, uncounted : faces of colliding pairs, and of pairs that do not count
-    named : faces selected in a list
+    selection : faces selected in a list
     motion : onion skins and the motion path of a point
     """
 
@@ -54,7 +54,7 @@ class Scene:
         self._hidden: npt.NDArray[np.bool_] | None = None
 
         self._ghost = Surface(model.faces, model.n_vertices, n_channels=4)
-        self._ghost_actor = actor_of(
+        self._ghost_actor = make_actor(
             self._ghost.polydata, True, ambient=0.4, diffuse=0.7, culling="back"
         )
         self._ghost_actor.ForceTranslucentOn()
@@ -62,7 +62,7 @@ class Scene:
 
         self.uncounted = FaceHighlight(self.surface, model.faces, UNCOUNTED_FACE, 1)
         self.crossing = FaceHighlight(self.surface, model.faces, COLLIDING_FACE, 2)
-        self.named = FaceHighlight(self.surface, model.faces, NAMED_FACE, 3)
+        self.selection = FaceHighlight(self.surface, model.faces, NAMED_FACE, 3)
 
         disc = pv.Disc(
             inner=0.0,
@@ -70,15 +70,24 @@ class Scene:
             normal=np.eye(3)[model.up_axis],
             c_res=96,
         )
-        self._floor = actor_of(disc, lighting=False, culling="back")
-        self._shadow = actor_of(self.surface.polydata, lighting=False)
+        self._floor = make_actor(disc, lighting=False, culling="back")
+        self._shadow = make_actor(self.surface.polydata, lighting=False)
         self._lift = 2e-3 * model.body_size
         self._ground: float | None = None
         self._sinks = self._is_shown = False
         for actor in (
             *(self._floor, self._shadow, self.body),
-            *(self.uncounted.nearer, self.crossing.nearer, self.named.nearer, self._ghost_actor),
-            *(self.uncounted.through, self.crossing.through, self.named.through),
+            *(
+                self.uncounted.visible_actor,
+                self.crossing.visible_actor,
+                self.selection.visible_actor,
+                self._ghost_actor,
+            ),
+            *(
+                self.uncounted.occluded_actor,
+                self.crossing.occluded_actor,
+                self.selection.occluded_actor,
+            ),
         ):
             self._renderer.AddActor(actor)
         self.outline = Outline(self._renderer)
@@ -179,7 +188,7 @@ class Scene:
         visible_faces = self._faces if hidden is None else self._faces[~hidden]
         for surface in (self.surface, self._ghost):
             surface.draw(visible_faces)
-        for highlight in (self.uncounted, self.crossing, self.named):
+        for highlight in (self.uncounted, self.crossing, self.selection):
             highlight.hidden = hidden
         if self._textured is not None:
             textured = self.is_textured
@@ -214,31 +223,31 @@ class Scene:
         """
         return self._patch.show(grip)
 
-    def fit_to_screen(self, sharpness: float) -> None:
+    def fit_to_screen(self, device_pixel_ratio: float) -> None:
         """Fit outline, patch, marks and shadow to the pose and camera, just before a picture.
 
         Parameters
         ----------
-        sharpness : device pixel ratio
+        device_pixel_ratio : physical pixels per device-independent pixel
         """
         # Use plain arrays: pyvista treats slices of its own arrays as the whole.
         vertices, normals = np.asarray(self.surface.vertices), np.asarray(self.surface.normals)
-        self.outline.fit(vertices, normals, sharpness)
-        self._patch.fit(sharpness)
-        self.marks.fit(self.view, sharpness)
+        self.outline.fit(vertices, normals, device_pixel_ratio)
+        self._patch.fit(device_pixel_ratio)
+        self.marks.fit(self.view, device_pixel_ratio)
         # Hide the shadow from below, where the floor is culled too.
         is_above = self.view.position[self._up_axis] > self._floor.position[self._up_axis]
         self._shadow.SetVisibility(bool(is_above and self._floor.GetVisibility()))
 
-    def look_like(self, other: Scene) -> None:
+    def copy_from(self, other: Scene) -> None:
         """Copy the content and the camera of another scene of the same mesh."""
         self.hide_faces(other._hidden)
         self.show_textured(other.is_textured)
         self.show(other.surface.vertices, other.surface.normals, other.surface.colours)
         if other.ghost_shown:
             self.show_ghost(other._ghost.vertices, other._ghost.normals)
-        self.crossing.look_like(other.crossing)
-        self.uncounted.look_like(other.uncounted)
+        self.crossing.copy_from(other.crossing)
+        self.uncounted.copy_from(other.uncounted)
         self.view = other.view
 
     @property

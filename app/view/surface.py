@@ -52,26 +52,26 @@ class Surface:
         self.polydata.DeleteCells()
 
 
-def actor_of(polydata: pv.PolyData, coloured: bool = False, **look: Any) -> pv.Actor:
+def make_actor(polydata: pv.PolyData, coloured: bool = False, **properties: Any) -> pv.Actor:
     """Return an actor that draws a mesh or lines and cannot be picked.
 
     Parameters
     ----------
     coloured : whether to colour by the mesh's active scalars, instead of one colour
-    look : properties of `pyvista.Property`
+    properties : properties of `pyvista.Property`
     """
     mapper = vtkPolyDataMapper()
     mapper.SetInputData(polydata)
     mapper.SetScalarVisibility(coloured)
-    actor = pv.Actor(mapper, pv.Property(interpolation="Gouraud", **look))
+    actor = pv.Actor(mapper, pv.Property(interpolation="Gouraud", **properties))
     actor.SetPickable(False)
     return actor
 
 
-def body_actor(polydata: pv.PolyData, coloured: bool = True, **look: Any) -> pv.Actor:
-    """Return an actor for a body: `actor_of` with a body's lighting."""
+def body_actor(polydata: pv.PolyData, coloured: bool = True, **properties: Any) -> pv.Actor:
+    """Return an actor for a body: `make_actor` with a body's lighting."""
     shine = {"ambient": 0.22, "diffuse": 0.92, "specular": 0.1, "specular_power": 18}
-    return actor_of(polydata, coloured, **shine, **look)
+    return make_actor(polydata, coloured, **shine, **properties)
 
 
 _ALONG = 0.85
@@ -174,9 +174,9 @@ class Patch:
         self._set_uniforms()
         return True
 
-    def fit(self, sharpness: float) -> None:
+    def fit(self, device_pixel_ratio: float) -> None:
         """Scale the rim to a screen's device pixel ratio."""
-        self._look[3] = sharpness
+        self._look[3] = device_pixel_ratio
         self._set_uniforms()
 
     def _along_of(self, vertices: npt.NDArray[np.intp] | None) -> npt.NDArray[np.float32]:

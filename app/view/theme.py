@@ -146,8 +146,8 @@ def icon(name: str, colour: str | None = None) -> QIcon:
         (QIcon.Mode.Normal, colour or theme.text),
         (QIcon.Mode.Disabled, mixed(theme.text, theme.window, 0.65).name()),
     ):
-        for sharpness in _SHARPNESSES:
-            drawn.addPixmap(pixmap(name, ink, ICON_SIZE, sharpness), mode)
+        for device_pixel_ratio in _SHARPNESSES:
+            drawn.addPixmap(pixmap(name, ink, ICON_SIZE, device_pixel_ratio), mode)
     return drawn
 
 
@@ -171,7 +171,7 @@ def redraw_icons(root: QObject) -> None:
             give_icon(holder, *drawing.split())
 
 
-def pixmap(name: str, colour: str, size: int, sharpness: float = 1.0) -> QPixmap:
+def pixmap(name: str, colour: str, size: int, device_pixel_ratio: float = 1.0) -> QPixmap:
     """Draw an icon at one size, or return it from the cache.
 
     Parameters
@@ -179,21 +179,21 @@ def pixmap(name: str, colour: str, size: int, sharpness: float = 1.0) -> QPixmap
     name : of the file, without its extension
     colour : "#rrggbb"
     size : side in device-independent pixels
-    sharpness : device pixel ratio
+    device_pixel_ratio : physical pixels per device-independent pixel
     """
-    key = f"{name} {colour} {size} {sharpness}"
+    key = f"{name} {colour} {size} {device_pixel_ratio}"
     canvas = QPixmap()
     if QPixmapCache.find(key, canvas):
         return canvas
     drawing = bundled_file("icons", f"{name}.svg").read_text().replace("currentColor", colour)
     renderer = QSvgRenderer(QByteArray(drawing.encode()))
-    side = round(size * sharpness)
+    side = round(size * device_pixel_ratio)
     canvas = QPixmap(QSize(side, side))
     canvas.fill(Qt.GlobalColor.transparent)
     painter = QPainter(canvas)
     renderer.render(painter, QRectF(0, 0, side, side))
     painter.end()
-    canvas.setDevicePixelRatio(sharpness)
+    canvas.setDevicePixelRatio(device_pixel_ratio)
     QPixmapCache.insert(key, canvas)
     return canvas
 

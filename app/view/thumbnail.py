@@ -84,18 +84,18 @@ def draw_pose(
     return np.ascontiguousarray(blocks.round().astype(np.uint8))
 
 
-def picture_of(
+def thumbnail_pixmap(
     vertices: npt.NDArray[Any],
     faces: npt.NDArray[np.int32],
     view: View,
     side: int,
-    sharpness: float,
+    device_pixel_ratio: float,
 ) -> QPixmap:
     """Draw a mesh in the theme's skin colour, in device-independent pixels; see `draw_pose`."""
-    n_pixels = round(side * sharpness)
+    n_pixels = round(side * device_pixel_ratio)
     pixels = draw_pose(vertices, faces, view, n_pixels, _SKIN[current_theme().is_dark])
     image = QImage(pixels.data, n_pixels, n_pixels, QImage.Format.Format_RGBA8888)
-    image.setDevicePixelRatio(sharpness)
+    image.setDevicePixelRatio(device_pixel_ratio)
     return QPixmap.fromImage(image)
 
 

@@ -15,7 +15,15 @@ from PySide6.QtOpenGLWidgets import QOpenGLWidget
 from PySide6.QtWidgets import QLabel, QMenu, QPushButton, QStackedLayout, QVBoxLayout, QWidget
 
 from app.editing.live_pose import domain_of
-from app.view.camera import Animation, View, between, followed, framing, kept_in_view, preset_view
+from app.view.camera import (
+    Animation,
+    View,
+    followed,
+    framing,
+    interpolated,
+    preset_view,
+    reframed_if_out_of_view,
+)
 from app.view.legend import DomainTag, LegendStrip
 from app.view.pictures import Pictures
 from app.view.shading import Known, Legend, Shader, Shading
@@ -278,7 +286,7 @@ class Viewport(QWidget):
         def on_close() -> None:
             # The delay lets the menu run the chosen command first.
             if self.mouse is not None:
-                self.mouse.look_again()
+                self.mouse.rehover()
 
         menu.aboutToShow.connect(on_open)
         menu.aboutToHide.connect(on_close)
@@ -322,10 +330,10 @@ class Viewport(QWidget):
 
     # The camera.
 
-    def point_out(self, faces: npt.NDArray[np.integer] | None) -> None:
+    def tint_faces(self, faces: npt.NDArray[np.integer] | None) -> None:
         """Tint the faces with these indices; None for none."""
         if self.scene is not None:
-            self.scene.named.show(faces)
+            self.scene.selection.show(faces)
             self._redraw()
 
     def set_camera(self, name: str, animated: bool = True) -> None:
@@ -348,7 +356,7 @@ class Viewport(QWidget):
             self.scene.view = end
             self.canvas.redraw()
             return
-        self._turn.begin(partial(between, self.scene.view, end))
+        self._turn.begin(partial(interpolated, self.scene.view, end))
 
     def look_at(self, places: npt.NDArray[np.floating]) -> None:
         """Look closely at two points, from a direction in which the gap between them shows.
@@ -369,7 +377,7 @@ class Viewport(QWidget):
                 towards = along
         around = _CLOSE_UP * self._document.model.body_size * np.array([[-1.0], [1.0]])
         end = framing(middle + around, towards, view.up, self._aspect)
-        self._turn.begin(partial(between, view, end))
+        self._turn.begin(partial(interpolated, view, end))
 
     def show_whole(self) -> None:
         """Look at the whole pose from the same side."""
@@ -378,7 +386,7 @@ class Viewport(QWidget):
         view = self.scene.view
         vertices = self._document.model.without_ground(self.shown_frame.vertices)
         end = framing(vertices, view.position - view.focus, view.up, self._aspect)
-        self._turn.begin(partial(between, view, end))
+        self._turn.begin(partial(interpolated, view, end))
 
     @Slot()
     def frame_pose(self) -> None:
@@ -446,7 +454,7 @@ class Viewport(QWidget):
             self.canvas.menu_wanted.connect(self._on_menu_wanted)
             self.mouse = Mouse(self._document, self.canvas, lambda: self.scene)
             self.mouse.pointed.connect(self._on_pointed)
-            self.mouse.helped_at.connect(self._show_tag)
+            self.mouse.whole_body_dragged.connect(self._show_tag)
             self.mouse.hinted.connect(self.hinted)
             self.mouse.camera_moved.connect(self._on_camera_moved)
             self.mouse.redraw_wanted.connect(self._redraw)
@@ -463,7 +471,7 @@ class Viewport(QWidget):
         self._highlight = None
         assert self.mouse is not None
         # Vertices of the previous model are not valid in this one.
-        self.mouse.let_go()
+        self.mouse.reset()
         self._place_camera = view is None
         if view is not None:
             self.scene.view = view
@@ -600,9 +608,9 @@ class Viewport(QWidget):
             if frame.latent is self._loaded and before is not None:
                 without_ground = self._document.model.without_ground
                 old, new = without_ground(before.vertices), without_ground(frame.vertices)
-                view = kept_in_view(scene.view, old, new, self._aspect)
+                view = reframed_if_out_of_view(scene.view, old, new, self._aspect)
                 if view is not None:
-                    self._turn.begin(partial(between, scene.view, view))
+                    self._turn.begin(partial(interpolated, scene.view, view))
         self._transition_to = self._loaded = None
         self._moment = moment
         if self.shading is Shading.EXACT:
@@ -719,7 +727,7 @@ class Viewport(QWidget):
             return domain
         model = self._document.model
         name = heading(model.domain_names[domain])
-        if self.mouse.helped or self._document.motion.whole_body:
+        if self.mouse.whole_body_drag or self._document.motion.whole_body:
             name += _HELPED
         self._tag.point_at(position, name, model.card.domain_colours[domain])
         return domain

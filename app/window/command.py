@@ -279,7 +279,7 @@ class Commands(QObject):
             for widget in widgets if command.in_view else ():
                 widget.addAction(self.actions[key])
 
-    def with_shortcuts(self) -> Iterator[tuple[str, list[Shortcut]]]:
+    def shortcuts_by_menu(self) -> Iterator[tuple[str, list[Shortcut]]]:
         """Yield each menu's title and its shortcuts, submenus included."""
         for listed in self._listed:
             yield _plain(listed.title), list(self._shortcuts(self.menus[listed.title]))

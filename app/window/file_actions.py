@@ -34,7 +34,7 @@ from app.window.dialogs.questions import (
     ask_to_turn,
 )
 from app.window.widgets import ListMenu, plain_tip
-from app.work.long_work import unwatched
+from app.work.long_work import as_task
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.table import (
     CHARACTER_SUFFIXES,
@@ -54,7 +54,7 @@ from lcollision_core.tasks.words import counted, menu_text
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.editing.settings import Settings
-    from app.view.offscreen import TurntableStyle
+    from app.view.offscreen import VideoStyle
     from app.view.viewport import Viewport
     from lcollision_core.bodies import Body, NamedPose, OtherModelError, SceneBody, SourceFile
     from lcollision_core.errors import WrongScaleError
@@ -131,8 +131,8 @@ class FileActions(QObject):
         self.recent_menu = ListMenu("Open &recent", window, attempt, self._fill_recent)
         self._fill_recent()
         self.models_menu = ListMenu("Mode&ls", window, attempt, self._fill_models)
-        document.tasks.may_replace = lambda: bool(attempt(self.may_lose_changes))
-        document.tasks.may_leave_pose = lambda: bool(attempt(self.may_lose_pose))
+        document.tasks.may_replace = lambda: bool(attempt(self.confirm_losing_changes))
+        document.tasks.may_leave_pose = lambda: bool(attempt(self.confirm_losing_pose))
         document.history.file_changed.connect(self._on_file)
         document.model_changed.connect(self._on_model)
         document.tasks.imported.connect(self._on_arrived)
@@ -144,8 +144,8 @@ class FileActions(QObject):
         )
         document.tasks.wrong_scale.connect(self._offer_scale, Qt.ConnectionType.QueuedConnection)
         self._dropped: tuple[Path, int] | None = None
-        self._told = ""
-        self._carried: NamedPose | None = None
+        self._last_message = ""
+        self._pose_to_restore: NamedPose | None = None
 
     def ask_and_open(self, title: str, *kinds: str) -> None:
         """Ask for a file of some kinds and open it; see `_kinds`."""
@@ -179,12 +179,12 @@ class FileActions(QObject):
         model = self._document.model
         if model.is_trained and not ask_to_turn(self._window, model.name):
             return
-        if self.may_lose_changes():
+        if self.confirm_losing_changes():
             self._document.tasks.turn_upright()
 
     def set_joint_role(self, joint: str, role: str | None) -> None:
         """Set the role of a character's joint and reopen the character with other sliders."""
-        if self.may_lose_changes():
+        if self.confirm_losing_changes():
             self._document.tasks.set_joint_role(joint, role)
 
     def open_path(
@@ -241,9 +241,9 @@ class FileActions(QObject):
             # No question about changes: the import can be undone.
             self._import_mesh(path, body_is_chosen)
         elif is_scene_file(path):
-            if self.may_lose_changes():
+            if self.confirm_losing_changes():
                 document.tasks.open_model(path)
-        elif self.may_lose_changes(with_library=suffix == MODEL_SUFFIX):
+        elif self.confirm_losing_changes(with_library=suffix == MODEL_SUFFIX):
             if suffix == POSES_SUFFIX:
                 self._require_model(path)
             openers[suffix](path)
@@ -259,7 +259,7 @@ class FileActions(QObject):
 
     def _open_motion(self, path: Path) -> None:
         self._require_model(path)
-        if self.may_lose_changes(with_library=False):
+        if self.confirm_losing_changes(with_library=False):
             self._document.timeline.open(path)
 
     def _open_examined(self, path: Path, beside: Body | None, read: FileContent) -> None:
@@ -276,7 +276,7 @@ class FileActions(QObject):
         if read is None or isinstance(read, OtherMesh):
             is_asked = path.suffix.lower() not in CHARACTER_SUFFIXES
             self._attempt(partial(self._import_mesh, path, is_asked=is_asked))
-        elif self._attempt(self.may_lose_changes):
+        elif self._attempt(self.confirm_losing_changes):
             self._document.tasks.open_model(path, read)
             self.settings["last_folder"] = str(path.resolve().parent)
 
@@ -303,7 +303,7 @@ class FileActions(QObject):
         from lcollision_core.tasks.scenes import kept_scene, with_body
 
         history = self._document.history
-        if self.may_lose_changes():
+        if self.confirm_losing_changes():
             file = str(history.model.own_file or history.model_file)
             scene = with_body(history.model, file, path)
             self._document.tasks.open_model(kept_scene(scene))
@@ -316,7 +316,7 @@ class FileActions(QObject):
         scene = as_scene(self._document.model)
         assert scene is not None
         assert scene.file is not None
-        if self.may_lose_changes(with_library=False):
+        if self.confirm_losing_changes(with_library=False):
             number = [member.name for member in scene.members].index(name)
             file = playing(scene.file, number, clip, start)
             scene_path = str(kept_scene(file))
@@ -327,9 +327,9 @@ class FileActions(QObject):
         from lcollision_core.tasks.scenes import with_ground
 
         history = self._document.history
-        if self._may_lose_motions() and self._may_lose_library():
+        if self._confirm_losing_motions() and self._may_lose_library():
             file = str(history.model.own_file or history.model_file)
-            self._carried = history.pose
+            self._pose_to_restore = history.pose
             self._document.tasks.open_model(with_ground(history.model, file))
 
     def save_scene(self) -> None:
@@ -347,7 +347,7 @@ class FileActions(QObject):
 
     def new_pose(self) -> None:
         """Start again from the first pose, unless the user wants to keep the changes."""
-        if self.may_lose_changes(with_library=False):
+        if self.confirm_losing_changes(with_library=False):
             self._document.new_pose()
 
     def save(self) -> bool:
@@ -398,7 +398,7 @@ class FileActions(QObject):
             pose = named_after(asked_pose, path)
             text = f"Saved “{pose.name}” to {path.name}; the pose opened since is unsaved"
             document.tasks.save_file(
-                path, unwatched(save_poses, path, model, poses, pose), lambda _: text
+                path, as_task(save_poses, path, model, poses, pose), lambda _: text
             )
         return True
 
@@ -595,11 +595,11 @@ class FileActions(QObject):
             style = replace(style, seconds=len(shown_motion) / style.rate)
             self._viewport.pictures.motion(path, style, shown_motion, self._viewport.follows)
 
-    def _video_style(self) -> TurntableStyle:
-        from app.view.offscreen import TurntableStyle
+    def _video_style(self) -> VideoStyle:
+        from app.view.offscreen import VideoStyle
 
         names = ("seconds", "width", "height", "rate", "background", "colour")
-        return TurntableStyle(*(self.settings[f"turntable_{name}"] for name in names))
+        return VideoStyle(*(self.settings[f"turntable_{name}"] for name in names))
 
     def _ask_save_after(self, form: QDialog, title: str, kinds: dict[str, str]) -> Path | None:
         """Show a form, then ask for a file to write; a turntable's format is listed first."""
@@ -609,18 +609,18 @@ class FileActions(QObject):
         kinds = dict(sorted(kinds.items(), key=lambda kind: kind[1] != first))
         return self.ask_save(title, self._name, kinds) if accepted else None
 
-    def may_lose_changes(self, with_library: bool = True) -> bool:
+    def confirm_losing_changes(self, with_library: bool = True) -> bool:
         """Ask about unsaved changes; return False if the user wants to go on editing.
 
         Parameters
         ----------
         with_library : whether to ask about an unwritten pose library too
         """
-        may_go = self._may_lose_motions() and self.may_lose_pose()
+        may_go = self._confirm_losing_motions() and self.confirm_losing_pose()
         return may_go and (not with_library or self._may_lose_library())
 
-    def _may_lose_motions(self) -> bool:
-        """Ask about edited motions; see `may_lose_changes`."""
+    def _confirm_losing_motions(self) -> bool:
+        """Ask about edited motions; see `confirm_losing_changes`."""
         document = self._document
         document.tasks.wait_for_saves()
         if document.has_model and not document.timeline.are_saved():
@@ -631,8 +631,8 @@ class FileActions(QObject):
             return answer is Choice.DISCARD
         return True
 
-    def may_lose_pose(self) -> bool:
-        """Ask about an unsaved pose that is not a motion's frame; see `may_lose_changes`."""
+    def confirm_losing_pose(self) -> bool:
+        """Ask about an unsaved pose that is not a motion's frame; see `confirm_losing_changes`."""
         document = self._document
         history = document.history
         if not document.has_model or history.state.moment is not None or not history.modified:
@@ -689,17 +689,17 @@ class FileActions(QObject):
         """Remember a file that has been opened, and report those dropped with it."""
         if path.suffix.lower() in (*READABLE_SUFFIXES, *CHARACTER_SUFFIXES):
             self._remember(path)
-        carried, self._carried = self._carried, None
+        carried, self._pose_to_restore = self._pose_to_restore, None
         if carried is not None and len(carried.latent) == self._document.model.latent_size:
             self._document.history.load(f"Load {carried.name}", carried, Source.TRAINING)
         dropped, self._dropped = self._dropped, None
         if dropped is not None and dropped[0].absolute() == path.absolute():
             others = counted(dropped[1] - 1, "other file was", "other files were")
-            self._document.message.emit(f"{self._told}; {others} not opened")
+            self._document.message.emit(f"{self._last_message}; {others} not opened")
 
     @Slot(str)
     def _on_message(self, sentence: str) -> None:
-        self._told = sentence
+        self._last_message = sentence
 
     @Slot(object)
     def _on_other_model(self, found: OtherModelError) -> None:

@@ -67,7 +67,7 @@ class Layout(QObject):
         self._window.restoreState(self._settings["window_layout"], _VERSION)
 
     @Slot()
-    def begin(self) -> None:
+    def apply_sizes(self) -> None:
         """Size the panels; only a window that is shown keeps the sizes."""
         self.fit()
         if self._settings["window_layout"].isEmpty():
@@ -112,13 +112,15 @@ class Layout(QObject):
             area = Qt.DockWidgetArea.BottomDockWidgetArea
         if window.corner(corner) is not area:
             window.setCorner(corner, area)
-        suiting = self._beside({key: self._suiting(key) for key in self._widths()}, _VIEW_WIDTH)
+        suiting = self._widths_beside_view(
+            {key: self._default_width(key) for key in self._widths()}, _VIEW_WIDTH
+        )
         panel_widths = {key: int(self._settings[f"{key}_width"] or suiting[key]) for key in suiting}
-        widths = self._beside(panel_widths, _LEAST_VIEW_WIDTH)
+        widths = self._widths_beside_view(panel_widths, _LEAST_VIEW_WIDTH)
         docks = [self._docks[key] for key in widths]
         window.resizeDocks(docks, list(widths.values()), Qt.Orientation.Horizontal)
 
-    def _beside(self, wanted: Mapping[str, int], view: int) -> dict[str, int]:
+    def _widths_beside_view(self, wanted: Mapping[str, int], view: int) -> dict[str, int]:
         """Return the widths of panels beside a view of this width, none below its minimum."""
         least = {key: self._docks[key].minimumSizeHint().width() for key in wanted}
         spare = self._window.width() - view - sum(least.values()) - len(wanted) * _LINE
@@ -142,7 +144,7 @@ class Layout(QObject):
         heights = [dock.sizeHint().height() for dock in docks]
         self._window.resizeDocks(docks, heights, Qt.Orientation.Vertical)
 
-    def _suiting(self, key: str) -> int:
+    def _default_width(self, key: str) -> int:
         """Return the default width of a panel for the window and its content."""
         width = self._docks[key].docking.width
         assert width is not None

@@ -70,7 +70,7 @@ class LearningActions(QObject):
         self._work = LongWork(self, "learning")
         self._work.failed.connect(document.failed)
         self.runs = LearningRuns(self)
-        self._told: dict[Path, RunState] = {}
+        self._previous_states: dict[Path, RunState] = {}
         self._opening: tuple[Path, Path] | None = None
         self.indicator = QToolButton()
         self.indicator.setObjectName("indicator")
@@ -160,7 +160,7 @@ class LearningActions(QObject):
             self._opening = None
             if run is not None and run.state == RunState.DONE:
                 run.work.remove()
-            self.runs.look()
+            self.runs.poll()
 
     @Slot()
     def _on_model(self) -> None:
@@ -168,7 +168,7 @@ class LearningActions(QObject):
             self._began = True
             # Load in a worker: the imports take longer than a frame.
             work = learning_jobs.load_learning
-            self._work.start("Looking for runs", work, lambda _: self.runs.begin())
+            self._work.start("Looking for runs", work, lambda _: self.runs.start_polling())
 
     @Slot()
     def _on_runs(self) -> None:
@@ -192,11 +192,11 @@ class LearningActions(QObject):
         for learning_run in self.runs.runs:
             is_new = (
                 learning_run.state == RunState.DONE
-                and self._told.get(learning_run.path) != RunState.DONE
+                and self._previous_states.get(learning_run.path) != RunState.DONE
             )
             if is_new and str(learning_run.path) not in self._files.settings["closed_learning"]:
                 self._show(learning_run.path, activates=False)
-        self._told = {run.path: run.state for run in self.runs.runs}
+        self._previous_states = {run.path: run.state for run in self.runs.runs}
 
     def _most_urgent(self) -> LearningRun | None:
         runs = sorted(self.runs.runs, key=lambda run: _MOST_URGENT.index(run.state))

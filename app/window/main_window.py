@@ -45,7 +45,7 @@ from lcollision_core.tasks.words import one_line
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from app.editing.recovery import Autosave, LostPose
+    from app.editing.recovery import Autosave, RecoverablePose
     from lcollision_core.meshes import Topology
 
 _log = logging.getLogger(__name__)
@@ -130,7 +130,7 @@ class MainWindow(EditorWindow):
         self._autosave = autosave
         autosave.failed.connect(self.show_failure)
 
-    def recover(self, lost: LostPose) -> None:
+    def recover(self, lost: RecoverablePose) -> None:
         """Continue with a pose recovered after a crash."""
         if self._autosave is not None:
             self._autosave.recover(lost)
@@ -143,7 +143,7 @@ class MainWindow(EditorWindow):
         if not event.spontaneous():
             # Otherwise the first button of the tool bar has the focus and looks selected.
             self.viewport.setFocus()
-        QTimer.singleShot(0, self, self._layout.begin)
+        QTimer.singleShot(0, self, self._layout.apply_sizes)
 
     def close_unasked(self) -> None:
         """Close without asking; unsaved changes are offered at the next start."""
@@ -164,7 +164,7 @@ class MainWindow(EditorWindow):
 
         def settle() -> bool:
             written = wait_for_exports(self, self.document, self.viewport.pictures)
-            return written and (self._unasked or self.files.may_lose_changes())
+            return written and (self._unasked or self.files.confirm_losing_changes())
 
         may_close = self.attempt(settle)
         # `close_unasked` dismisses an open question but cannot close a window that is closing.
@@ -200,8 +200,8 @@ class MainWindow(EditorWindow):
         )
         for panel in (self.sliders, self.collision):
             panel.domain_hovered.connect(self.viewport.highlight_domain)
-        self.collision.faces_named.connect(self.viewport.point_out)
-        self.collision.places_named.connect(self.viewport.look_at)
+        self.collision.faces_selected.connect(self.viewport.tint_faces)
+        self.collision.points_selected.connect(self.viewport.look_at)
         for rows in (self.sliders, self.collision.prediction):
             rows.menu_wanted.connect(self._body_menus.open_on_part)
         self.viewport.domain_hovered.connect(self.sliders.light_domain)

@@ -115,9 +115,9 @@ class StartUp(QObject):
 
     @Slot()
     def _offer_recovery(self) -> None:
-        from app.editing.recovery import find_lost_poses
+        from app.editing.recovery import find_recoverable_poses
 
-        lost = find_lost_poses()
+        lost = find_recoverable_poses()
         for pose in lost:
             answer = ask_about_recovery(self._window, pose)
             if answer is Choice.SAVE:

@@ -73,8 +73,8 @@ LEAST_TRACK = 60
 SWATCH = 12
 """Side of a body part's colour swatch, in device-independent pixels."""
 
-silent = QSignalBlocker
-"""Block a widget's signals while it follows the document: ``with silent(widget):``."""
+signals_blocked = QSignalBlocker
+"""Block a widget's signals while it follows the document: ``with signals_blocked(widget):``."""
 
 Margins = tuple[int, int, int, int]
 Box = TypeVar("Box", QHBoxLayout, QVBoxLayout)
@@ -239,17 +239,17 @@ def title_row(title: str | QLabel, source: ElidedLabel) -> QHBoxLayout:
     return hbox(named, source, wide=source)
 
 
-def swatch(colour: str, side: int, sharpness: float = 1.0) -> QIcon:
+def swatch_icon(colour: str, side: int, device_pixel_ratio: float = 1.0) -> QIcon:
     """Return a square of a colour, with an outline so that white shows on white.
 
     Parameters
     ----------
     colour : "#rrggbb"
     side : in device-independent pixels
-    sharpness : device pixel ratio
+    device_pixel_ratio : physical pixels per device-independent pixel
     """
-    picture = QPixmap(QSize(side, side) * sharpness)
-    picture.setDevicePixelRatio(sharpness)
+    picture = QPixmap(QSize(side, side) * device_pixel_ratio)
+    picture.setDevicePixelRatio(device_pixel_ratio)
     picture.fill(Qt.GlobalColor.transparent)
     painter = QPainter(picture)
     painter.setRenderHint(QPainter.RenderHint.Antialiasing)
@@ -327,7 +327,7 @@ class HoverRow(QWidget):
             painter.drawRoundedRect(self.rect(), 5, 5)
         if self._colour:
             area = QRectF(self._swatch_left, self.height() / 2 - 6, SWATCH, SWATCH)
-            fill_with(painter, area, self._colour, 3)
+            fill_area(painter, area, self._colour, 3)
 
 
 class FileDrops(QObject):
@@ -358,7 +358,7 @@ class FileDrops(QObject):
         return super().eventFilter(watched, event)
 
 
-class Sign(QLabel):
+class ThemedIcon(QLabel):
     """An icon that follows the theme.
 
     Parameters
@@ -403,12 +403,12 @@ class Slider(QSlider):
 
     Attributes
     ----------
-    held_at : fraction of the groove at which contact stops the value, None where it does not
+    contact_position : fraction of the groove at which contact stops the value; None for none
     """
 
     drag_abandoned = Signal()
 
-    held_at: float | None = None
+    contact_position: float | None = None
 
     def __init__(self, colour: str | None = None) -> None:
         super().__init__(Qt.Orientation.Horizontal)
@@ -423,7 +423,7 @@ class Slider(QSlider):
         return 0.0
 
     @property
-    def ends(self) -> tuple[float, float]:
+    def value_range(self) -> tuple[float, float]:
         """Values at the ends of the groove."""
         return float(self.minimum()), float(self.maximum())
 
@@ -450,7 +450,7 @@ class Slider(QSlider):
         if is_escape and self.isSliderDown():
             event.accept()
             if event.type() is QEvent.Type.KeyPress:
-                with silent(self):
+                with signals_blocked(self):
                     self.setSliderDown(False)
                 self.drag_abandoned.emit()
             return True
@@ -465,7 +465,7 @@ class Slider(QSlider):
         x = event.position().x()
         self.setSliderDown(True)
         if abs(x - self._handle_x()) > HANDLE + 2:
-            low, high = self.ends
+            low, high = self.value_range
             fraction = (x - HANDLE) / max(self.width() - 2 * HANDLE, 1.0)
             self.move_to(low + fraction * (high - low))
         self._pointer, self._exact_value = x, self.place
@@ -475,7 +475,7 @@ class Slider(QSlider):
         if not self.isSliderDown():
             return
         x = event.position().x()
-        low, high = self.ends
+        low, high = self.value_range
         way = (x - self._pointer) * (high - low) / max(self.width() - 2 * HANDLE, 1.0)
         if event.modifiers() & _FINE_KEYS:
             way *= _FINE
@@ -504,12 +504,16 @@ class Slider(QSlider):
             painter.setBrush(QColor(theme.muted))
             painter.drawRect(QRectF(start - 0.5, middle - 5, 1, 10))
         handle = self._handle_x()
-        reached = handle if self.held_at is None else left + (right - left) * self.held_at
+        reached = (
+            handle
+            if self.contact_position is None
+            else left + (right - left) * self.contact_position
+        )
         enabled = self.isEnabled()
         filled = self._colour or theme.accent if enabled else theme.track
         bar = QRectF(min(start, reached), middle - 2.5, abs(reached - start), 5)
         if bar.width() > 0.0:
-            fill_with(painter, bar, filled, 0.0)
+            fill_area(painter, bar, filled, 0.0)
         if self.hasFocus():
             halo = QColor(theme.accent)
             halo.setAlpha(90)
@@ -520,14 +524,14 @@ class Slider(QSlider):
         rim = theme.accent if bright else theme.muted if enabled else theme.border
         painter.setPen(QPen(QColor(rim), 1.6))
         painter.drawEllipse(QPointF(handle, middle), HANDLE - 1.2, HANDLE - 1.2)
-        if self.held_at is not None:
+        if self.contact_position is not None:
             # Drawn last, to stay visible over the handle.
             painter.setPen(QPen(QColor(theme.card), 1.0))
             painter.setBrush(QColor(CONTACT))
             painter.drawRoundedRect(QRectF(reached - 2.5, middle - 8.5, 5, 17), 2, 2)
 
     def _handle_x(self) -> float:
-        low, high = self.ends
+        low, high = self.value_range
         fraction = (self.place - low) / ((high - low) or 1.0)
         return HANDLE + (self.width() - 2 * HANDLE) * fraction
 
@@ -550,7 +554,7 @@ def wheel_if_focused(widget: QWidget, event: QWheelEvent, handle: object) -> Non
         event.ignore()
 
 
-def fill_with(painter: QPainter, area: QRectF, colour: str, radius: float) -> None:
+def fill_area(painter: QPainter, area: QRectF, colour: str, radius: float) -> None:
     """Fill an area with a body part's colour, outlined if it would not be visible otherwise."""
     edge = visible_colour(colour)
     painter.setBrush(QColor(colour))
@@ -631,7 +635,7 @@ def explain(action: QAction, tip: str) -> None:
     action.setStatusTip(tip)
 
 
-_TOLD_MILLISECONDS = 8000
+_REFUSAL_MILLISECONDS = 8000
 
 
 class ListMenu(QMenu):
@@ -694,25 +698,27 @@ class NumberBox(QDoubleSpinBox):
     ----------
     decimals : 0 for a whole number
     low, high : limits
-    trims : whether trailing zeros are left out; they always are with more than three decimals
+    strip_zeros : whether trailing zeros are left out; they always are with more than three decimals
     """
 
     refused = Signal(str)
 
-    _trims = False
+    _strip_zeros = False
 
-    def __init__(self, decimals: int, low: float, high: float, *, trims: bool = False) -> None:
+    def __init__(
+        self, decimals: int, low: float, high: float, *, strip_zeros: bool = False
+    ) -> None:
         super().__init__()
-        self._trims = trims or decimals > 3
+        self._strip_zeros = strip_zeros or decimals > 3
         self.setDecimals(decimals)
         self.setRange(low, high)
         self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         self.setKeyboardTracking(False)
 
     def textFromValue(self, value: float) -> str:  # noqa: N802
-        """Format a value, without trailing zeros if the box trims them."""
+        """Format a value, without trailing zeros if the box strips them."""
         text = super().textFromValue(value)
-        if not self._trims:
+        if not self._strip_zeros:
             return text
         return text.rstrip("0").rstrip(self.locale().decimalPoint())
 
@@ -746,7 +752,7 @@ class NumberBox(QDoubleSpinBox):
         self.refused.emit(sentence)
         if self.isVisible():
             below = self.mapToGlobal(QPoint(0, self.height() // 2))
-            QToolTip.showText(below, sentence, self, self.rect(), _TOLD_MILLISECONDS)
+            QToolTip.showText(below, sentence, self, self.rect(), _REFUSAL_MILLISECONDS)
         return text
 
     def _is_beyond(self, text: str) -> bool:

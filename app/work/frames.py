@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
 
-OwnSpace = Callable[[], "PoseSpace"]
+SpaceFactory = Callable[[], "PoseSpace"]
 """Returns the body's pose space in a motion's frame: see `Motion.space_at`."""
 
 _QUICK_CHECK_SECONDS = 0.006
@@ -31,7 +31,7 @@ _CHECKS = 5
 """Number of recent checks whose median time is used."""
 
 
-def no_points() -> FloatArray:
+def empty_points() -> FloatArray:
     """Return an empty (0, 3) array, read-only."""
     return _frozen(np.empty((0, 3)))
 
@@ -76,8 +76,8 @@ class PoseFrame:
     prediction: PosePrediction | None
     found: SelfCollisions | None
     seconds: float
-    contacts: FloatArray = field(default_factory=no_points)
-    standing: FloatArray = field(default_factory=no_points)
+    contacts: FloatArray = field(default_factory=empty_points)
+    standing: FloatArray = field(default_factory=empty_points)
     target: FloatArray | None = None
     miss: float = 0.0
     settled: bool = True

@@ -74,7 +74,7 @@ class _KeptMotion:
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _StoredMotions:
     """`EditedMotions` as stored in a file."""
 
     file: str
@@ -84,7 +84,7 @@ class _Kept:
     motions: tuple[_KeptMotion, ...]
 
 
-def to_keep(motions: EditedMotions) -> dict[str, Any]:
+def to_json_values(motions: EditedMotions) -> dict[str, Any]:
     """Return edited motions as JSON values for a file.
 
     Raises
@@ -105,7 +105,7 @@ def to_keep(motions: EditedMotions) -> dict[str, Any]:
             _KeptMotion(name, shape, tuple(changed.tolist()), text, name in motions.saved)
         )
     file, stamp = str(motions.file.absolute()), motions.stamp
-    return to_json(_Kept(file, stamp, motions.open, motions.frame, tuple(kept_frames)))
+    return to_json(_StoredMotions(file, stamp, motions.open, motions.frame, tuple(kept_frames)))
 
 
 def read_lost(
@@ -170,11 +170,11 @@ def _motions(body: Body, path: Path, job: Job) -> EditedMotions | None:
     if document is None:
         return None
     try:
-        stored = from_json(_Kept, document, "the motion")
+        stored = from_json(_StoredMotions, document, "the motion")
     except ValueError as error:
         raise _lost("the motion", str(error)) from error
     file, name = Path(stored.file), f"“{stored.open}”"
-    why = why_gone(file, stored.stamp)
+    why = unreadable_reason(file, stored.stamp)
     if why:
         raise _lost(name, why)
     own_file = own_motions(body)[0]
@@ -211,7 +211,7 @@ def _codes(was: Motion, kept: _KeptMotion) -> FloatArray:
     return codes
 
 
-def why_gone(file: Path, stamp: FileStamp | None) -> str:
+def unreadable_reason(file: Path, stamp: FileStamp | None) -> str:
     """Return why motions cannot be read from a file again, or "" if it is unchanged."""
     from lcollision_core.files import file_stamp
 

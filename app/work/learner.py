@@ -68,8 +68,8 @@ def main(arguments: list[str]) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: job.cancel())
     try:
-        with obeying(work, job):
-            learn_model(work, job.part(lambda _: start.take()))
+        with cancel_on_stop_file(work, job):
+            learn_model(work, job.part(lambda _: start.claim()))
     except CancelledError:
         return 130
     except LCollisionError as error:
@@ -90,12 +90,12 @@ def main(arguments: list[str]) -> int:
         _tell_failure(work, _BUG.format(type(error).__name__, error, work.path))
         return 3
     finally:
-        start.give_up()
+        start.withdraw()
     return 0
 
 
 @contextmanager
-def obeying(work: WorkFolder, job: Job) -> Iterator[None]:
+def cancel_on_stop_file(work: WorkFolder, job: Job) -> Iterator[None]:
     """Cancel `job` once a window requests a stop, and remove the request afterwards.
 
     Parameters
@@ -104,14 +104,14 @@ def obeying(work: WorkFolder, job: Job) -> Iterator[None]:
     job : of the work inside the block
     """
     ended = threading.Event()
-    looking = threading.Thread(target=_obey, args=(work, job, ended), daemon=True)
+    looking = threading.Thread(target=_watch_stop_file, args=(work, job, ended), daemon=True)
     looking.start()
     try:
         yield
     finally:
         ended.set()
         looking.join()
-        _leave(work)
+        _clean_up(work)
 
 
 def _give_way() -> None:
@@ -128,7 +128,7 @@ def _give_way() -> None:
             Path("/proc/self/autogroup").write_text(str(_NICENESS), encoding="ascii")
 
 
-def _obey(work: WorkFolder, job: Job, ended: threading.Event) -> None:
+def _watch_stop_file(work: WorkFolder, job: Job, ended: threading.Event) -> None:
     """Cancel the job once a window requests a stop."""
     while not ended.wait(_SECONDS_BETWEEN_LOOKS):
         if (work.path / STOP).exists():
@@ -145,7 +145,7 @@ class _Start:
     def __init__(self, work: WorkFolder, job: Job) -> None:
         self._work, self._job, self._is_taken = work, job, False
 
-    def take(self) -> None:
+    def claim(self) -> None:
         """Delete the file at the first call, made by the holder; if it is missing, stop the run."""
         if self._is_taken:
             return
@@ -155,7 +155,7 @@ class _Start:
         except FileNotFoundError:
             self._job.cancel()
 
-    def give_up(self) -> None:
+    def withdraw(self) -> None:
         """Delete the request of a run that ended before it began."""
         if not self._is_taken and not self._work.is_held:
             with suppress(OSError):
@@ -172,7 +172,7 @@ def _tell_failure(work: WorkFolder, sentence: str) -> None:
             work.tell(replace(failed, seconds_left=None))
 
 
-def _leave(work: WorkFolder) -> None:
+def _clean_up(work: WorkFolder) -> None:
     """Delete the stop request, and the whole work folder if the request discards it."""
     if work.is_held:
         # The request is for the other process.

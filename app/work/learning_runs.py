@@ -97,12 +97,12 @@ class LearningRuns(QObject):
         self.runs: tuple[LearningRun, ...] = ()
         self._starting: tuple[Path, float] | None = None
         self._timer = QTimer(self, interval=POLL_MILLISECONDS)
-        self._timer.timeout.connect(self.look)
+        self._timer.timeout.connect(self.poll)
 
-    def begin(self) -> None:
+    def start_polling(self) -> None:
         """Look now and start polling."""
         self._timer.start()
-        self.look()
+        self.poll()
 
     def close(self) -> None:
         """Stop polling; a running process continues."""
@@ -154,7 +154,7 @@ class LearningRuns(QObject):
             (path / WANTED).touch()
         except OSError as error:
             raise LCollisionError.unwritable(path, error, "free some space there") from error
-        self.look()
+        self.poll()
 
     def stop(self, path: Path, discard: bool = False) -> None:
         """Stop a run, whichever window started it; it can be continued unless discarded.
@@ -172,10 +172,10 @@ class LearningRuns(QObject):
                 run.work.remove()
         except OSError as error:
             raise LCollisionError.unwritable(path, error, "free some space there") from error
-        self.look()
+        self.poll()
 
     @Slot()
-    def look(self) -> None:
+    def poll(self) -> None:
         """Update all runs, and start a waiting one if none is running."""
         from lcollision_core.tasks.work_folder import list_work
 

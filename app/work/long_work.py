@@ -15,7 +15,7 @@ Task = Callable[[Job], Any]
 """Long work, called in another thread; it returns the result."""
 
 
-def unwatched(work: Callable[..., Any], *arguments: Any) -> Task:
+def as_task(work: Callable[..., Any], *arguments: Any) -> Task:
     """Return a task of work that neither reports progress nor can be stopped."""
     return lambda _: work(*arguments)
 

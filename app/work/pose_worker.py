@@ -12,8 +12,8 @@ from PySide6.QtCore import QObject, Qt, Signal, Slot
 from app.work.frames import (
     FrameEvaluator,
     MeasuredFrame,
-    OwnSpace,
     PoseFrame,
+    SpaceFactory,
     keep_torch_to_one_thread,
 )
 from app.work.threads import Response, end_thread, guarded, started_thread
@@ -68,7 +68,7 @@ class MotionStart:
     pins: tuple[Pin, ...]
     options: DragOptions
     placement: RigidTransform | None
-    space: OwnSpace | None = None
+    space: SpaceFactory | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ class PoseRequest:
     predicts: bool = False
     unchecked: PoseFrame | None = None
     placement: RigidTransform | None = None
-    space: OwnSpace | None = None
+    space: SpaceFactory | None = None
     unmeasured: PoseFrame | None = None
 
     @property

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from app.editing.recovery import find_lost_poses
+from app.editing.recovery import find_recoverable_poses
 from app.editing.settings import SETTINGS, Settings
 from app.work import log
 
@@ -37,7 +37,7 @@ def test_a_session_of_pipes_is_passed_over(name: str, tmp_path: Path) -> None:
     session = tmp_path / "0123"
     session.mkdir()
     os.mkfifo(session / name)
-    assert find_lost_poses(tmp_path) == []
+    assert find_recoverable_poses(tmp_path) == []
 
 
 @pytest.mark.parametrize(
@@ -55,5 +55,5 @@ def test_a_damaged_session_is_cleared_away(content: bytes, tmp_path: Path) -> No
     session.mkdir()
     (session / "session.json").write_bytes(content)
     (session / "poses.json").write_bytes(b"{}")
-    assert find_lost_poses(tmp_path) == []
+    assert find_recoverable_poses(tmp_path) == []
     assert not session.exists()

@@ -171,7 +171,7 @@ def decoded(document: PoseDocument) -> npt.NDArray[np.float32]:
 def handle(row: CodeRow) -> QPoint:
     """Return the position of a row's handle in its slider."""
     slider = row.slider
-    low, high = slider.ends
+    low, high = slider.value_range
     share = (slider.place - low) / (high - low)
     return QPoint(round(HANDLE + share * (slider.width() - 2 * HANDLE)), slider.height() // 2)
 

@@ -138,12 +138,12 @@ def _show_contacts(window: EditorWindow) -> None:
     viewport.set_shading(Shading.EXACT)
 
     def end() -> None:
-        viewport.point_out(None)
+        viewport.tint_faces(None)
         # Restore the shading unless the user has changed it meanwhile.
         if viewport.shading is Shading.EXACT:
             viewport.set_shading(before)
 
-    dialog.faces_named.connect(viewport.point_out)
+    dialog.faces_selected.connect(viewport.tint_faces)
     dialog.finished.connect(end)
     dialog.show()
     # Place the dialog over the sliders, so that the body and the verdict stay visible.

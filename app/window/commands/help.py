@@ -12,7 +12,7 @@ HELP = Menu("&Help")
 @HELP.command("shortcuts", "&Keyboard and mouse", "F1", "All shortcuts", "info")
 @without_body
 def _shortcuts(window: EditorWindow) -> None:
-    show_shortcuts(window.commands.with_shortcuts(), window)
+    show_shortcuts(window.commands.shortcuts_by_menu(), window)
 
 
 @HELP.command("log", "Open &log file", "Ctrl+Shift+L", "Open the log with the details of errors")

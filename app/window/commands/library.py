@@ -17,7 +17,7 @@ from app.editing.tasks import Work
 from app.window.command import EditorWindow, Menu, called, greyed, unless
 from app.window.dialogs.forms import MotionDialog
 from app.window.dialogs.questions import ask_for_name, ask_to_replace
-from app.work.long_work import unwatched
+from app.work.long_work import as_task
 from lcollision_core.tasks.editing import save_poses
 from lcollision_core.tasks.words import counted, menu_text
 
@@ -51,7 +51,7 @@ def _export(window: EditorWindow, poses: tuple[NamedPose, ...], title: str) -> N
     path: Path | None = window.files.ask_save(title, name, {"Poses": ".json"})
     if path is not None:
         text = f"Exported {counted(len(poses), 'pose')} to {path.name}"
-        job = unwatched(save_poses, path, model, poses)
+        job = as_task(save_poses, path, model, poses)
         document.tasks.save_file(path, job, lambda _: text)
 
 

@@ -20,7 +20,7 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import NORMAL, ROW_HEIGHT
 from app.window.dialogs.questions import free_model_name, why_no_model_name
-from app.window.widgets import Mnemonics, dialog_vbox, hbox, labelled, swatch, vbox
+from app.window.widgets import Mnemonics, dialog_vbox, hbox, labelled, swatch_icon, vbox
 from lcollision_core.errors import ModelFileError
 from lcollision_core.tasks.changing import PartEdits
 
@@ -185,7 +185,7 @@ class BodyPartsDialog(QDialog):
 
     def _put_colour(self, item: QListWidgetItem, colour: str) -> None:
         item.setData(_COLOUR, colour)
-        item.setIcon(swatch(colour, _SWATCH, self.devicePixelRatioF()))
+        item.setIcon(swatch_icon(colour, _SWATCH, self.devicePixelRatioF()))
 
     def _move(self, by: int) -> None:
         row = self.list.currentRow()

@@ -83,10 +83,10 @@ class ContactsDialog(QDialog):
 
     Signals
     -------
-    faces_named : indices of the faces of the groups selected in the tree or the boxes below it
+    faces_selected : indices of the faces of the groups selected in the tree or the boxes below it
     """
 
-    faces_named = Signal(object)
+    faces_selected = Signal(object)
 
     def __init__(self, document: PoseDocument, parent: QWidget) -> None:
         super().__init__(parent)
@@ -445,7 +445,7 @@ class ContactsDialog(QDialog):
     def _name(self, *names: str) -> None:
         """Tint the faces of the named groups in the view."""
         faces = [group.faces for group in self._groups() if group.name in names]
-        self.faces_named.emit(np.concatenate(faces) if faces else None)
+        self.faces_selected.emit(np.concatenate(faces) if faces else None)
 
     @Slot()
     def _name_choice(self) -> None:

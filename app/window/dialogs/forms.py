@@ -23,7 +23,7 @@ from PySide6.QtWidgets import (
 
 from app.editing.settings import SETTINGS, Settings
 from app.view.theme import NORMAL, WIDE
-from app.window.widgets import Mnemonics, NumberBox, dialog_vbox, labelled, swatch
+from app.window.widgets import Mnemonics, NumberBox, dialog_vbox, labelled, swatch_icon
 from lcollision_core.files.table import FILES, WRITABLE_SUFFIXES
 from lcollision_core.options import ExportRequest, PrintOptions
 from lcollision_core.tasks.words import menu_text
@@ -61,7 +61,7 @@ class ColourButton(QPushButton):
             self._show(colour)
 
     def _show(self, colour: QColor) -> None:
-        self.setIcon(swatch(colour.name(), self.iconSize().height(), self.devicePixelRatioF()))
+        self.setIcon(swatch_icon(colour.name(), self.iconSize().height(), self.devicePixelRatioF()))
         self.setText(colour.name())
 
 
@@ -116,11 +116,13 @@ class Form(QDialog):
         step: float = 1.0,
         tip: str = "",
         decimals: int = 0,
-        trims: bool = False,
+        strip_zeros: bool = False,
     ) -> NumberBox:
         """Add a field for a number, by default an integer; see `NumberBox`."""
         setting = SETTINGS[key]
-        field = NumberBox(decimals, setting.low or 0.0, setting.high or 0.0, trims=trims)
+        field = NumberBox(
+            decimals, setting.low or 0.0, setting.high or 0.0, strip_zeros=strip_zeros
+        )
         field.setSingleStep(step)
         field.setSuffix(suffix)
         field.setValue(self._settings[key])
@@ -276,7 +278,7 @@ def print_form(settings: Settings, parent: QWidget) -> Form:
     form = Form("Export for 3D printing", "Choose file…", settings, parent)
     form.add_number("print_height", "Height", " mm", 10.0, "Of the figure, without its base", 1)
     tip = "Open layers are made this thick; thinner walls of closed parts are reported"
-    form.add_number("print_wall", "Least wall", " mm", 0.1, tip, 2, trims=True)
+    form.add_number("print_wall", "Least wall", " mm", 0.1, tip, 2, strip_zeros=True)
     ways = {
         "auto": "Close hulls, thicken sheets",
         "close": "Close their holes",
@@ -517,7 +519,9 @@ class MotionDialog(_FrameForm):
             # Keep the remembered form if it is not offered, or not the one preselected.
             del self._readers["motion_form"]
         tip = "One pose is one frame"
-        self.rate = self.add_number("export_rate", "Frames per second", "", 1.0, tip, 3, trims=True)
+        self.rate = self.add_number(
+            "export_rate", "Frames per second", "", 1.0, tip, 3, strip_zeros=True
+        )
         if rate is not None:
             self.rate.setValue(rate)
             self._readers["export_rate"] = self._remembered_rate

@@ -12,7 +12,7 @@ from app.view.theme import CLOSE, NORMAL, TIGHT
 from app.window.widgets import (
     Card,
     Mnemonics,
-    Sign,
+    ThemedIcon,
     dialog_vbox,
     labelled,
     scrolling,
@@ -103,7 +103,7 @@ class JointsDialog(QDialog):
             choice.setAccessibleName(f"Joint of the motion for {words or joint}")
             self.choices[joint] = choice
             if joint in self._match.unsure:
-                sign = Sign(_SIGN)
+                sign = ThemedIcon(_SIGN)
                 sign.show_icon("question", "colliding")
                 sign.setToolTip("Not told by names and places")
                 grid.addWidget(sign, row, 0)

@@ -25,12 +25,12 @@ from app.window.widgets import (
     SWATCH,
     Card,
     Mnemonics,
-    Sign,
+    ThemedIcon,
     dialog_vbox,
     hbox,
     labelled,
     screen_of,
-    swatch,
+    swatch_icon,
     vbox,
 )
 from app.work import learning_jobs
@@ -112,7 +112,7 @@ class LearningDialog(QDialog):
         self._reading = 0
         self.which = QComboBox()
         self.which.setAccessibleName("Model being learned")
-        self._sign = Sign(_SIGN)
+        self._sign = ThemedIcon(_SIGN)
         self.headline = labelled("", "headline", wraps=True)
         self.state = labelled("", wraps=True)
         self.bar = QProgressBar()
@@ -297,7 +297,7 @@ class LearningDialog(QDialog):
         run = self._runs.run_of(self._require_path())
         if run is not None:
             run.work.remove()
-        self._runs.look()
+        self._runs.poll()
 
     def _on_card(self, path: Path, learned: LearnedModel) -> None:
         from app.view.figures import parts_image
@@ -322,10 +322,10 @@ class _StageRows(Card):
 
     def __init__(self) -> None:
         super().__init__()
-        self._rows: dict[str, tuple[Sign, QLabel, QLabel]] = {}
+        self._rows: dict[str, tuple[ThemedIcon, QLabel, QLabel]] = {}
         for stage, words in STAGE_WORDS.items():
             sign, name, spent = (
-                Sign(_STAGE_SIGN),
+                ThemedIcon(_STAGE_SIGN),
                 labelled(with_capital(words)),
                 labelled("", "caption"),
             )
@@ -381,7 +381,9 @@ class LearnedCardView(QWidget):
             zip(model.domain_names, model.card.domain_colours, strict=True)
         ):
             sign, text = QLabel(), labelled(with_capital(one_line(name)), "aside")
-            sign.setPixmap(swatch(colour, SWATCH, self.devicePixelRatioF()).pixmap(SWATCH, SWATCH))
+            sign.setPixmap(
+                swatch_icon(colour, SWATCH, self.devicePixelRatioF()).pixmap(SWATCH, SWATCH)
+            )
             row, column = divmod(index, 2)
             self._parts.addWidget(sign, row, 2 * column)
             self._parts.addWidget(text, row, 2 * column + 1)

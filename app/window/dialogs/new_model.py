@@ -30,7 +30,7 @@ from PySide6.QtWidgets import (
 
 from app.view.camera import preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
-from app.view.thumbnail import picture_of
+from app.view.thumbnail import thumbnail_pixmap
 from app.window.dialogs.learning import STAGE_WORDS
 from app.window.dialogs.questions import free_model_name, why_no_model_name
 from app.window.widgets import (
@@ -227,7 +227,7 @@ class PosesPage(Page):
             "from them alone.",
         )
         self._summary: SourcesSummary | None = None
-        self.clip, self.rate = QComboBox(), NumberBox(3, 0, 240, trims=True)
+        self.clip, self.rate = QComboBox(), NumberBox(3, 0, 240, strip_zeros=True)
         self.clip.setAccessibleName("Animation")
         self.clip.setMinimumContentsLength(12)
         self.rate.setSpecialValueText("as in the file")
@@ -595,7 +595,9 @@ class BodyPicture(QLabel):
         self.has_body = True
         front = np.array([0.0, 0.0, 1.0] if up_axis == 1 else [0.0, -1.0, 0.0])
         view = preset_view("Three-quarter", vertices, up_axis, front, 1.0)
-        self.setPixmap(picture_of(vertices, faces, view, _PREVIEW_WIDTH, self.devicePixelRatioF()))
+        self.setPixmap(
+            thumbnail_pixmap(vertices, faces, view, _PREVIEW_WIDTH, self.devicePixelRatioF())
+        )
 
 
 class NewModelDialog(QDialog):

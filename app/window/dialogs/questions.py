@@ -25,7 +25,7 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.theme import NORMAL, WIDE, current_theme, pixmap
-from app.window.widgets import Mnemonics, Sign, dialog_vbox, hbox, labelled, vbox
+from app.window.widgets import Mnemonics, ThemedIcon, dialog_vbox, hbox, labelled, vbox
 from app.work.log import log_file
 from app.work.threads import Failure
 from lcollision_core.tasks.words import counted, heading, menu_text, one_line, with_capital
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from app.editing.document import PoseDocument
-    from app.editing.recovery import LostPose
+    from app.editing.recovery import RecoverablePose
     from app.view.pictures import Pictures
     from lcollision_core.errors import WrongScaleError
 
@@ -97,7 +97,7 @@ def ask_about_library(parent: QWidget, model: str) -> Choice:
     return _ask(parent, "Unsaved library", text, note, ("Try again", "Discard", "Cancel"))
 
 
-def ask_about_recovery(parent: QWidget, lost: LostPose) -> Choice:
+def ask_about_recovery(parent: QWidget, lost: RecoverablePose) -> Choice:
     """Offer to recover a pose, or an edited motion at a frame, after a crash.
 
     Returns
@@ -113,10 +113,10 @@ def ask_about_recovery(parent: QWidget, lost: LostPose) -> Choice:
         f"{missing}."
     )
     note = f"It was saved automatically on {moment.day} {moment:%B at %H:%M}. Recover it?"
-    if lost.why_pose_alone:
+    if lost.motion_loss_reason:
         note = (
-            f"As {lost.why_pose_alone}, only the pose “{lost.pose_name}” can be recovered, not the "
-            "edits of the motion. Recover it?"
+            f"As {lost.motion_loss_reason}, only the pose “{lost.pose_name}” can be recovered, "
+            "not the edits of the motion. Recover it?"
         )
     return _ask(parent, f"Recover a {kind}", text, note, ("Recover", "Delete it", "Ask later"))
 
@@ -407,7 +407,7 @@ class FailureDialog(QDialog):
         what, advice = map(with_capital, map(one_line, (failure.headline, failure.next_step)))
         if advice and not advice.endswith((".", "?", "!")):
             advice += "."
-        sign = Sign(36)
+        sign = ThemedIcon(36)
         sign.show_icon("warning", "colliding")
         self.what = labelled(what, "verdict", wraps=True)
         self.advice = labelled(advice, wraps=True)

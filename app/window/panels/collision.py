@@ -25,7 +25,7 @@ from app.window.widgets import (
     Card,
     ElidedLabel,
     NumberBox,
-    Sign,
+    ThemedIcon,
     hbox,
     labelled,
     plain_tip,
@@ -89,7 +89,7 @@ class Fact(QWidget):
         super().__init__()
         self._is_aside = is_aside
         self.answer: bool | None = None
-        self.sign = Sign(18)
+        self.sign = ThemedIcon(18)
         self._text = labelled("", "aside" if is_aside else "", wraps=True)
         if is_aside:
             show_verdict(self._text, "aside")
@@ -142,7 +142,7 @@ class ResolveCard(Card):
         locked = "All body parts are locked: unlock one to resolve"
         self._locked = labelled(locked, "caption", wraps=True)
         self.stack.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
-        self.clearance = NumberBox(2, 0.0, 100.0 * _LARGEST_CLEARANCE, trims=True)
+        self.clearance = NumberBox(2, 0.0, 100.0 * _LARGEST_CLEARANCE, strip_zeros=True)
         self.clearance.setToolTip(
             "Distance that Resolve and Solid keep between body parts; parts near at rest may "
             "come to half their rest distance"
@@ -361,17 +361,17 @@ class ExactCard(Card):
 
     Signals
     -------
-    faces_named : indices of faces to tint in the view, or None
-    places_named : (2, 3) array, two points to bring into view
+    faces_selected : indices of faces to tint in the view, or None
+    points_selected : (2, 3) array, two points to bring into view
     """
 
-    faces_named = Signal(object)
-    places_named = Signal(object)
+    faces_selected = Signal(object)
+    points_selected = Signal(object)
 
     def __init__(self, document: PoseDocument) -> None:
         super().__init__("exact")
         self._document = document
-        self._sign = Sign(_SIGN_SIZE)
+        self._sign = ThemedIcon(_SIGN_SIZE)
         self.verdict = labelled("", "headline", wraps=True)
         self.details = labelled("", "caption", wraps=True)
         self.source = ElidedLabel(_SOURCE)
@@ -463,18 +463,18 @@ class ExactCard(Card):
     def _on_clicked(self, shown: bool) -> None:
         nearest = self._document.motion.nearest
         if shown and nearest is not None:
-            self.places_named.emit(nearest.points)
+            self.points_selected.emit(nearest.points)
 
     @Slot(bool)
     def _on_shown(self, shown: bool) -> None:
         """Tint the two nearest faces and their neighbours: single faces are too small to see."""
         nearest = self._document.motion.nearest
         if not shown or nearest is None:
-            self.faces_named.emit(None)
+            self.faces_selected.emit(None)
             return
         faces = self._document.model.faces
         around = np.isin(faces, faces[nearest.faces]).any(axis=1)
-        self.faces_named.emit(np.flatnonzero(around))
+        self.faces_selected.emit(np.flatnonzero(around))
 
     def _say(self, verdict: SelfCollisions) -> None:
         document = self._document
@@ -535,10 +535,10 @@ class ProposalCard(Card):
 
     Signals
     -------
-    faces_named : indices of faces to tint in the view, or None
+    faces_selected : indices of faces to tint in the view, or None
     """
 
-    faces_named = Signal(object)
+    faces_selected = Signal(object)
 
     def __init__(self, document: PoseDocument) -> None:
         super().__init__()
@@ -582,12 +582,12 @@ class ProposalCard(Card):
         more = [f"and {len(lines) - _LISTED} more"] if len(lines) > _LISTED else []
         self.listed.setText("\n".join([*lines[:_LISTED], *more]))
         self.show()
-        self.faces_named.emit(proposed.faces)
+        self.faces_selected.emit(proposed.faces)
 
     @Slot()
     def _end(self) -> None:
         self.hide()
-        self.faces_named.emit(None)
+        self.faces_selected.emit(None)
 
     @Slot()
     def _decline(self) -> None:
@@ -612,8 +612,8 @@ class CollisionPanel(QWidget):
     Signals
     -------
     domain_hovered : int or None, the domain of the row under the pointer
-    faces_named : indices of faces to tint in the view, or None
-    places_named : (2, 3) array, two points to bring into view
+    faces_selected : indices of faces to tint in the view, or None
+    points_selected : (2, 3) array, two points to bring into view
 
     Parameters
     ----------
@@ -622,8 +622,8 @@ class CollisionPanel(QWidget):
     """
 
     domain_hovered = Signal(object)
-    faces_named = Signal(object)
-    places_named = Signal(object)
+    faces_selected = Signal(object)
+    points_selected = Signal(object)
 
     docking = Docking(
         "collision",
@@ -652,9 +652,9 @@ class CollisionPanel(QWidget):
         headline = vbox(self.exact, margins=(CLOSE, TIGHT, CLOSE, 0))
         remedy = vbox(self.resolve, margins=(CLOSE, 0, CLOSE, CLOSE))
         self.setLayout(vbox(headline, self._area, remedy))
-        self.exact.places_named.connect(self.places_named)
+        self.exact.points_selected.connect(self.points_selected)
         for card in (self.exact, self.proposal):
-            card.faces_named.connect(self.faces_named)
+            card.faces_selected.connect(self.faces_selected)
         self.prediction.domain_hovered.connect(self.domain_hovered)
         document.history.outcome_changed.connect(self._on_outcome)
 

@@ -39,9 +39,9 @@ from app.editing.history import Source
 from app.editing.live_pose import starter_poses, training_pose
 from app.view.camera import preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT
-from app.view.thumbnail import picture_of
+from app.view.thumbnail import thumbnail_pixmap
 from app.window.panels.dock import Docking, bring_up
-from app.window.widgets import ElidedLabel, Slider, hbox, labelled, plain_tip, silent, vbox
+from app.window.widgets import ElidedLabel, Slider, hbox, labelled, plain_tip, signals_blocked, vbox
 from app.work.threads import single_shot
 from lcollision_core.tasks.words import menu_text, one_line
 
@@ -63,14 +63,14 @@ class PoseGrid(QListWidget):
 
     Signals
     -------
-    picture_wanted : int, a visible row that has no thumbnail yet
+    thumbnail_requested : int, a visible row that has no thumbnail yet
 
     Attributes
     ----------
     hint : text shown if there are no poses
     """
 
-    picture_wanted = Signal(int)
+    thumbnail_requested = Signal(int)
 
     def __init__(self) -> None:
         super().__init__()
@@ -86,7 +86,7 @@ class PoseGrid(QListWidget):
         self.setUniformItemSizes(True)
         self.setWordWrap(True)
         delegate = _CellDelegate(self._cell, self)
-        delegate.picture_wanted.connect(self.picture_wanted)
+        delegate.thumbnail_requested.connect(self.thumbnail_requested)
         self.setItemDelegate(delegate)
         self.setVerticalScrollMode(QListWidget.ScrollMode.ScrollPerPixel)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
@@ -112,7 +112,7 @@ class _CellDelegate(QStyledItemDelegate):
     cell : size of both together
     """
 
-    picture_wanted = Signal(int)
+    thumbnail_requested = Signal(int)
 
     def __init__(self, cell: QSize, parent: QObject) -> None:
         super().__init__(parent)
@@ -126,7 +126,7 @@ class _CellDelegate(QStyledItemDelegate):
         option.displayAlignment = Qt.AlignmentFlag.AlignHCenter | Qt.AlignmentFlag.AlignTop
         if option.icon.isNull():
             option.features |= QStyleOptionViewItem.ViewItemFeature.HasDecoration
-            self.picture_wanted.emit(index.row())
+            self.thumbnail_requested.emit(index.row())
         option.text = option.text.replace("_", "_\u200b")
 
     def sizeHint(  # noqa: N802
@@ -146,7 +146,7 @@ _HEIGHT_PER_ROW = 480
 
 _BLEND_STEPS = 100
 _ONLY = QItemSelectionModel.SelectionFlag.ClearAndSelect
-_CAME_WITH = {
+_BUILT_IN_TEXTS = {
     True: ("Training", "The poses that the model learned from"),
     False: ("Rest pose", "The character at rest; its clips are on the timeline"),
 }
@@ -190,11 +190,11 @@ class LibraryPanel(QWidget):
         self._hidden: npt.NDArray[np.bool_] | None = None
         self._wanted: list[NamedPose] = []
         self._may_draw = False
-        self._due = single_shot(self, _PAUSE, self._draw_next)
+        self._thumbnail_timer = single_shot(self, _PAUSE, self._draw_next)
         self.list = PoseGrid()
         self.list.setAccessibleName("Poses")
         self._sources = QButtonGroup(self)
-        self.training = self._source_button(*_CAME_WITH[True])
+        self.training = self._source_button(*_BUILT_IN_TEXTS[True])
         self.starter = self._source_button(
             "Starter poses", "Poses to start from, made by turning the character's joints"
         )
@@ -233,7 +233,7 @@ class LibraryPanel(QWidget):
         self.list.itemSelectionChanged.connect(self._on_chosen)
         self.list.currentRowChanged.connect(self._on_chosen)
         self.list.customContextMenuRequested.connect(self._on_menu)
-        self.list.picture_wanted.connect(self._on_picture_wanted)
+        self.list.thumbnail_requested.connect(self._on_thumbnail_requested)
         self.blend.sliderPressed.connect(self._on_blend_pressed)
         self.blend.valueChanged.connect(self._on_blend)
         self.blend.sliderReleased.connect(self._on_blend_released)
@@ -292,7 +292,7 @@ class LibraryPanel(QWidget):
     def allow_pictures(self) -> None:
         """Start drawing thumbnails, once everything else is on the screen."""
         self._may_draw = True
-        self._due.start()
+        self._thumbnail_timer.start()
 
     def redraw(self) -> None:
         """Draw all thumbnails again, as for another theme."""
@@ -305,7 +305,7 @@ class LibraryPanel(QWidget):
 
     def stop(self) -> None:
         """Stop drawing thumbnails, as the window closes."""
-        self._due.stop()
+        self._thumbnail_timer.stop()
         self._may_draw = False
 
     def load_chosen(self) -> None:
@@ -354,7 +354,7 @@ class LibraryPanel(QWidget):
             self._poses = list(
                 document.library.poses if is_library else document.history.file_poses
             )
-        with silent(self.list):
+        with signals_blocked(self.list):
             self.list.clear()
             for pose in self._poses:
                 item = QListWidgetItem(one_line(pose.name))
@@ -436,7 +436,7 @@ class LibraryPanel(QWidget):
 
     @Slot()
     def _on_model(self) -> None:
-        text, tip = _CAME_WITH[self._document.model.is_trained]
+        text, tip = _BUILT_IN_TEXTS[self._document.model.is_trained]
         self.training.setText(text)
         self.training.setToolTip(tip)
         has_starters = bool(self._document.model.starter_poses)
@@ -478,10 +478,10 @@ class LibraryPanel(QWidget):
         self.menu_wanted.emit(self.list.viewport().mapToGlobal(position))
 
     @Slot(int)
-    def _on_picture_wanted(self, row: int) -> None:
+    def _on_thumbnail_requested(self, row: int) -> None:
         self._wanted.append(self._poses[row])
         if self._may_draw:
-            self._due.start()
+            self._thumbnail_timer.start()
 
     @Slot()
     def _draw_next(self) -> None:
@@ -497,11 +497,11 @@ class LibraryPanel(QWidget):
         for row, pose in enumerate(self._poses):
             if pose.latent.tobytes() == key and not self.list.isRowHidden(row):
                 self.list.item(row).setIcon(self._pictures[key])
-        self._due.start()
+        self._thumbnail_timer.start()
 
     def _picture(self, pose: NamedPose) -> QIcon:
         model = self._document.model
-        sharpness = self.devicePixelRatioF()
+        device_pixel_ratio = self.devicePixelRatioF()
         posed_vertices = vertices = model.decode(pose.latent, 1).astype(np.float32)
         faces = model.faces if self._hidden is None else model.faces[~self._hidden]
         if pose.moves is not None:
@@ -510,7 +510,7 @@ class LibraryPanel(QWidget):
             faces = faces[(model.attention_mask[part] > 0.5)[faces].all(axis=1)]
             posed_vertices = vertices[np.unique(faces)]
         view = preset_view("Three-quarter", posed_vertices, model.up_axis, model.front, 1.0)
-        drawn = picture_of(vertices, faces, view, THUMBNAIL, sharpness)
+        drawn = thumbnail_pixmap(vertices, faces, view, THUMBNAIL, device_pixel_ratio)
         picture = QIcon()
         for mode in (QIcon.Mode.Normal, QIcon.Mode.Selected):
             picture.addPixmap(drawn, mode)
@@ -558,7 +558,7 @@ class LibraryPanel(QWidget):
         self._clear_blend()
 
     def _clear_blend(self) -> None:
-        with silent(self.blend):
+        with signals_blocked(self.blend):
             self.blend.setValue(0)
         self._share.setText("")
 

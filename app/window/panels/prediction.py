@@ -24,7 +24,7 @@ from app.window.widgets import (
     longest_name,
     plain_tip,
     show_verdict,
-    silent,
+    signals_blocked,
     title_row,
     vbox,
 )
@@ -152,7 +152,7 @@ class DomainRow(HoverRow):
 
     def show_lock(self, locked: bool) -> None:
         """Show whether the domain is locked."""
-        with silent(self.lock):
+        with signals_blocked(self.lock):
             self.lock.setChecked(locked)
         give_icon(self.lock, "lock" if locked else "unlock", "text" if locked else "muted")
         self.lock.setToolTip(

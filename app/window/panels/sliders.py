@@ -30,7 +30,7 @@ from app.window.widgets import (
     plain_tip,
     scrolling,
     show_verdict,
-    silent,
+    signals_blocked,
     vbox,
 )
 from lcollision_core.tasks.words import heading
@@ -101,7 +101,7 @@ class CodeSlider(Slider):
         self.show_number(0.0)
 
     @property
-    def ends(self) -> tuple[float, float]:
+    def value_range(self) -> tuple[float, float]:
         """Range in the displayed unit."""
         return self._low, self._high
 
@@ -126,18 +126,18 @@ class CodeSlider(Slider):
 
     def _show(self, place: float) -> None:
         self._place = min(max(place, self._low), self._high)
-        with silent(self):
+        with signals_blocked(self):
             self.setValue(round(self._place))
         self.update()
 
-    def show_held(self, number: float | None) -> None:
+    def show_contact_limit(self, number: float | None) -> None:
         """Mark the number at which contact stopped the handle's; None removes the mark."""
         span = self._high - self._low
         held_span = None
         if number is not None:
             held_span = min(max((number * self._shown - self._low) / span, 0.0), 1.0)
-        if held_span != self.held_at:
-            self.held_at = held_span
+        if held_span != self.contact_position:
+            self.contact_position = held_span
             self.update()
 
     @property
@@ -179,7 +179,7 @@ class CodeRow(HoverRow):
 
     Signals
     -------
-    asked : float, the number that the user wants; contact may stop the pose before it
+    requested : float, the number that the user wants; contact may stop the pose before it
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ class CodeRow(HoverRow):
     number : of the pose shown, NaN while the user changes it
     """
 
-    asked = Signal(float)
+    requested = Signal(float)
 
     def __init__(
         self, document: PoseDocument, code: int, index: int, domain: int | None, name_width: int
@@ -277,7 +277,7 @@ class CodeRow(HoverRow):
         if not self.slider.isSliderDown():
             self.slider.show_number(number)
         low, high = self._limits
-        with silent(self.field):
+        with signals_blocked(self.field):
             limits = min(low, number), max(high, number)
             if limits != self._field_limits:
                 # Only if changed: Qt lays out the panel again.
@@ -291,7 +291,7 @@ class CodeRow(HoverRow):
     def _move(self, number: float) -> None:
         # NaN differs from any number, so the pose's number is shown, wherever contact stops it.
         self.number = np.nan
-        self.asked.emit(number)
+        self.requested.emit(number)
         self._document.motion.set_code(self.code, number)
 
     def _explain(self, number: float) -> None:
@@ -316,9 +316,9 @@ class CodeRow(HoverRow):
             words = f"stopped by contact; {words}"
         self.field.setToolTip(plain_tip(f"{self._name}: {words}"))
 
-    def show_held(self, number: float | None) -> None:
+    def show_contact_limit(self, number: float | None) -> None:
         """Mark the number at which contact stopped the requested one; None removes the mark."""
-        self.slider.show_held(number)
+        self.slider.show_contact_limit(number)
         self.field.setProperty("held", number is not None)
         self._explain(self.field.value() / self._shown)
 
@@ -455,7 +455,7 @@ class SliderGroup(QWidget):
             row = CodeRow(document, code, index, self._domain, name_width)
             row.hovered.connect(self._panel.domain_hovered)
             row.menu_wanted.connect(self._panel.menu_wanted)
-            row.asked.connect(partial(self._panel.note_asked, row))
+            row.requested.connect(partial(self._panel.remember_request, row))
             self._column.addWidget(row)
             self.rows.append(row)
             order += [row.slider, row.field]
@@ -498,7 +498,7 @@ class SlidersPanel(QWidget):
         self.groups: list[SliderGroup] = []
         self._fingerprint = ""
         self._latent_size = self._natural_width = 0
-        self._asked: tuple[CodeRow, float, FloatArray] | None = None
+        self._request: tuple[CodeRow, float, FloatArray] | None = None
         self.filter = QLineEdit()
         self.filter.setPlaceholderText("Filter sliders, such as “finger”")
         self.filter.setToolTip("Show the sliders of a part or motion, such as “left hand twist”")
@@ -559,7 +559,7 @@ class SlidersPanel(QWidget):
         return next(row for row in self.groups[index].rows if row.code == code)
 
     def _on_model(self) -> None:
-        self._asked = None
+        self._request = None
         for group in self.groups:
             self._column.removeWidget(group)
             group.deleteLater()
@@ -602,22 +602,22 @@ class SlidersPanel(QWidget):
                 if row.number != latent[row.code]:
                     row.show_number(float(latent[row.code]))
 
-    def note_asked(self, row: CodeRow, number: float) -> None:
+    def remember_request(self, row: CodeRow, number: float) -> None:
         """Remember the requested number, to show where contact stops it."""
-        if self._asked is not None and self._asked[0] is not row:
-            self._asked[0].show_held(None)
-        self._asked = row, number, np.delete(self.document.history.latent, row.code)
+        if self._request is not None and self._request[0] is not row:
+            self._request[0].show_contact_limit(None)
+        self._request = row, number, np.delete(self.document.history.latent, row.code)
 
     def _on_frame(self) -> None:
         frame, latent = self.document.motion.frame, self.document.history.latent
-        if self._asked is None or frame is None:
+        if self._request is None or frame is None:
             return
-        row, number, others = self._asked
+        row, number, others = self._request
         reached = float(latent[row.code])
         is_held = len(frame.contacts) > 0 and abs(number - reached) > _LEAST_HELD
         # If other codes have changed since, the contacts are not those of this request.
         is_held = is_held and np.array_equal(np.delete(latent, row.code), others)
-        row.show_held(reached if is_held else None)
+        row.show_contact_limit(reached if is_held else None)
         if frame.settled:
             # Even if the number has not changed: the handle may have.
             row.show_number(reached)

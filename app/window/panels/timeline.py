@@ -22,7 +22,7 @@ from PySide6.QtWidgets import (
 from app.view.theme import ICON_SIZE, NORMAL, TIGHT, give_icon
 from app.window.panels.dock import Docking, bring_up
 from app.window.panels.timeline_strip import BETWEEN, TimelineStrip
-from app.window.widgets import ElidedLabel, NumberBox, hbox, labelled, silent, vbox
+from app.window.widgets import ElidedLabel, NumberBox, hbox, labelled, signals_blocked, vbox
 from lcollision_core.tasks.words import counted, duration_text, menu_text, spent_text
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ class TimelinePanel(QWidget):
 
     @Slot()
     def _on_model(self) -> None:
-        with silent(self.part):
+        with signals_blocked(self.part):
             self.part.clear()
             self.part.addItem(_WHOLE_BODY, None)
             for number, name in enumerate(self._document.model.domain_names):
@@ -199,7 +199,7 @@ class TimelinePanel(QWidget):
     def _on_opened(self) -> None:
         timeline = self._timeline
         motion = timeline.motion
-        with silent(self.clips):
+        with signals_blocked(self.clips):
             self.clips.clear()
             self.clips.addItems([menu_text(name) for name in timeline.motions])
             if motion is not None and motion.name in timeline.motions:
@@ -244,7 +244,7 @@ class TimelinePanel(QWidget):
         """Show the current range, speed and easing."""
         timeline = self._timeline
         self.strip.set_range(timeline.first, timeline.last)
-        with silent(self.speed), silent(self.easing):
+        with signals_blocked(self.speed), signals_blocked(self.easing):
             self.speed.setCurrentIndex(self.speed.findData(timeline.playback.speed))
             self.easing.setValue(timeline.easing)
         self._follow_frame()

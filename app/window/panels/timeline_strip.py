@@ -477,9 +477,9 @@ class TimelineStrip(QWidget):
         """Draw the cached picture, renewed if it has changed, and the playhead over it."""
         if not len(self._times):
             return
-        sharpness = self.devicePixelRatioF()
-        if self._picture is None or self._picture.devicePixelRatio() != sharpness:
-            self._picture = self._drawn(sharpness)
+        device_pixel_ratio = self.devicePixelRatioF()
+        if self._picture is None or self._picture.devicePixelRatio() != device_pixel_ratio:
+            self._picture = self._drawn(device_pixel_ratio)
         painter = QPainter(self)
         painter.drawPixmap(0, 0, self._picture)
         self._draw_playhead(painter)
@@ -495,9 +495,9 @@ class TimelineStrip(QWidget):
         """Return the left edge of the frames, right of the labels and the curve's scale."""
         width = QFontMetricsF(self._font()).horizontalAdvance
         # Align with device pixels: images in between are blurred.
-        sharpness = self.devicePixelRatioF()
+        device_pixel_ratio = self.devicePixelRatioF()
         right = NORMAL + width(_CURVE_LABEL) + NORMAL + CLOSE
-        return math.ceil(right * sharpness) / sharpness
+        return math.ceil(right * device_pixel_ratio) / device_pixel_ratio
 
     def _ruler_height(self) -> int:
         return math.ceil(QFontMetricsF(self._font()).height()) + 11
@@ -516,17 +516,17 @@ class TimelineStrip(QWidget):
         top = (exact if self._estimate is None else estimate).bottom() + TIGHT
         return ruler, exact, estimate, QRectF(left, top, width, self.height() - top - CLOSE)
 
-    def _drawn(self, sharpness: float) -> QPixmap:
+    def _drawn(self, device_pixel_ratio: float) -> QPixmap:
         theme = current_theme()
-        picture = QPixmap((self.size() * sharpness).expandedTo(QSize(1, 1)))
-        picture.setDevicePixelRatio(sharpness)
+        picture = QPixmap((self.size() * device_pixel_ratio).expandedTo(QSize(1, 1)))
+        picture.setDevicePixelRatio(device_pixel_ratio)
         picture.fill(Qt.GlobalColor.transparent)
         painter = QPainter(picture)
         painter.setRenderHint(QPainter.RenderHint.Antialiasing)
         painter.setFont(self._font())
         track = self._track()
         ruler, exact, estimate, curve = self._rows(track)
-        starts = track.columns(max(round(track.width * sharpness), 1))
+        starts = track.columns(max(round(track.width * device_pixel_ratio), 1))
         named = [(exact, "Exact check"), (curve, heading(self._curve_name) or _CURVE_LABEL)]
         if self._estimate is not None:
             named.append((estimate, "Estimate"))
@@ -773,8 +773,8 @@ def _draw_bars(
     colours : (W, 3) uint8 array, red, green, blue
     """
     theme = current_theme()
-    sharpness = painter.device().devicePixelRatioF()
-    n_rows = round(row.height() * sharpness)
+    device_pixel_ratio = painter.device().devicePixelRatioF()
+    n_rows = round(row.height() * device_pixel_ratio)
     above = np.arange(n_rows, 0, -1)[:, None]
     is_bar = above <= np.round(heights * n_rows)
     if track.cell >= _SEPARATE:
@@ -783,11 +783,11 @@ def _draw_bars(
     red, green, blue = colours.astype(np.uint32).T
     opaque = np.uint32(0xFF000000)
     pixels = np.where(is_bar, opaque | red << 16 | green << 8 | blue, 0).astype(np.uint32)
-    diagonal = (np.arange(len(heights)) + above) // max(round(sharpness), 1)
+    diagonal = (np.arange(len(heights)) + above) // max(round(device_pixel_ratio), 1)
     hatched = np.isnan(heights) & (diagonal % 5 == 0)
     pixels[hatched] = mixed(theme.border, theme.muted, 0.35).rgba()
     image = QImage(
         pixels.tobytes(), len(heights), n_rows, 4 * len(heights), QImage.Format.Format_ARGB32
     )
-    image.setDevicePixelRatio(sharpness)
+    image.setDevicePixelRatio(device_pixel_ratio)
     painter.drawImage(row.topLeft(), image)

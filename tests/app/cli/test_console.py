@@ -19,21 +19,21 @@ import pty
 
 BARS = {
     "label": (
-        "from app.cli.label import told_of\n"
+        "from app.cli.label import bar_content\n"
         "from lcollision_core.labels import LabelStatus\n"
         "status = LabelStatus(30, 200, 15, 28, 10.0)\n"
         "rows = True",
         ("Labelling", "30/200", "3/s, 0:01:01 left, 50.0 % collide"),
     ),
     "embedding": (
-        "from app.cli.train import told_of_embedding as told_of\n"
+        "from app.cli.train import bar_content_of_embedding as bar_content\n"
         "from lcollision_core.embedding.training_run import TrainingStatus\n"
         "status = TrainingStatus('held out', 'level 2', 40, 100, 0.04, 0.01)\n"
         "rows = False",
         ("held out: learning level 2", "40%", "error level 1 4.00 %, both levels 1.00 %"),
     ),
     "predictor": (
-        "from app.cli.train import told_of_predictor as told_of\n"
+        "from app.cli.train import bar_content_of_predictor as bar_content\n"
         "from lcollision_core.predictor import PredictorStatus\n"
         "status = PredictorStatus(1, 30, 20, 100, 0.5, (0.04, None), None)\n"
         "rows = False",
@@ -45,7 +45,7 @@ BARS = {
         ),
     ),
     "patches": (
-        "from app.cli.train import told_of_predictor as told_of\n"
+        "from app.cli.train import bar_content_of_predictor as bar_content\n"
         "from lcollision_core.predictor import PredictorStatus\n"
         "status = PredictorStatus(0, 30, 0, 100, None, (None, None), 0.25)\n"
         "rows = False",
@@ -56,8 +56,8 @@ BARS = {
 
 def draw(code: str, error: int, before: str = "") -> None:
     """Draw one status in another process, whose standard error is `error`."""
-    bar = "from app.cli.console import status_bar as bar\nwith bar('', told_of, rows=rows) as show:"
-    held = f"{before}\n{code}\n{bar}\n    show.report(status)\n"
+    bar = "from app.cli.console import status_bar\nwith status_bar('', bar_content, rows=rows)"
+    held = f"{before}\n{code}\n{bar} as show:\n    show.report(status)\n"
     held += "    import time; time.sleep(0.3)"
     environment = {**os.environ, "COLUMNS": "160", "TERM": "xterm"}
     subprocess.run([sys.executable, "-c", held], env=environment, stderr=error, check=True)

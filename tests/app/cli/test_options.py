@@ -11,7 +11,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from app.cli.options import Without, takes_options
+from app.cli.options import Excluding, takes_options
 from lcollision_core.bodies import NamedPose, open_body, write_poses
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import read_pose_set
@@ -37,7 +37,7 @@ taken: list[Choices] = []
 
 
 @takes_options
-def command(choices: Annotated[Choices, Without({"kind"})], loud: bool = False) -> None:
+def command(choices: Annotated[Choices, Excluding({"kind"})], loud: bool = False) -> None:
     """Keep the received values."""
     taken.append(choices)
     assert loud in (True, False)

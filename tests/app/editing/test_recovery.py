@@ -15,7 +15,7 @@ import pytest
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.editing.recovery import Autosave, Session, find_lost_poses
+from app.editing.recovery import Autosave, Session, find_recoverable_poses
 from app.editing.timeline import Timeline
 from lcollision_core.bodies import (
     LearnedBody,
@@ -121,7 +121,7 @@ def let_die(script: str, opened: Path, folder: Path) -> None:
         assert editor.stdout is not None
         assert editor.stdout.readline() == "written\n"
         # A running editor's session is not lost.
-        assert find_lost_poses(folder) == []
+        assert find_recoverable_poses(folder) == []
     finally:
         editor.send_signal(signal.SIGKILL)
         editor.wait()
@@ -134,12 +134,12 @@ def test_a_killed_editor_loses_nothing_that_was_written(
 ) -> None:
     folder = tmp_path / "sessions"
     let_die(EDITOR, model_file, folder)
-    (lost,) = find_lost_poses(folder)
+    (lost,) = find_recoverable_poses(folder)
     assert lost.pose_name == "kick"
     assert Path(lost.model) == model_file
     assert lost.file is None
     # Another editor that starts now finds nothing: this one holds the session.
-    assert find_lost_poses(folder) == []
+    assert find_recoverable_poses(folder) == []
 
     autosave = Autosave(document, folder, seconds=0.05)
     with qtbot.waitSignal(document.tasks.recovered, timeout=20_000):
@@ -168,16 +168,16 @@ def test_what_cannot_be_read_stays_for_another_day(model_file: Path, tmp_path: P
     # Simulate a disk error.
     (session / "session.json").unlink()
     (session / "session.json").mkdir()
-    assert find_lost_poses(folder) == []
+    assert find_recoverable_poses(folder) == []
     (session / "session.json").rmdir()
     (session / "session.json").write_text(kept)
-    (lost,) = find_lost_poses(folder)
+    (lost,) = find_recoverable_poses(folder)
     assert lost.pose_name == "kick"
     lost.session.discard()
     # A session without a pose is useless.
     session.mkdir()
     (session / "session.json").write_text(kept)
-    assert find_lost_poses(folder) == []
+    assert find_recoverable_poses(folder) == []
     assert not session.exists()
 
 
@@ -190,7 +190,7 @@ def test_an_editor_told_to_end_keeps_its_last_edit(document: PoseDocument, tmp_p
             document.pins.pin([document.motion.grip_at(3)])
         autosave = Autosave(document, folder, seconds=1000.0)
         assert autosave.close(keep=True)
-        found = find_lost_poses(folder)
+        found = find_recoverable_poses(folder)
         assert len(found) == edited
     (kept,) = read_poses(found[0].poses_file, document.model)
     assert kept.latent[0] == 0.5
@@ -211,7 +211,7 @@ def test_the_poses_of_the_file_are_recovered_beside_the_working_pose(
     assert Autosave(document, folder, seconds=1000.0).close(keep=True)
     document.history.mark_saved()
     document.new_pose()
-    (lost,) = find_lost_poses(folder)
+    (lost,) = find_recoverable_poses(folder)
     autosave = Autosave(document, folder, seconds=1000.0)
     with qtbot.waitSignal(document.tasks.recovered):
         autosave.recover(lost)
@@ -248,7 +248,7 @@ def test_save_after_a_recovery_sees_that_another_program_wrote_the_file(
         held = json.loads(session.read_text())
         del held["file_stamp"]
         session.write_text(json.dumps(held))
-    (lost,) = find_lost_poses(folder)
+    (lost,) = find_recoverable_poses(folder)
     autosave = Autosave(document, folder, seconds=1000.0)
     with qtbot.waitSignal(document.tasks.recovered):
         autosave.recover(lost)
@@ -293,7 +293,7 @@ def test_a_lock_that_changes_later_is_kept_too(
     with qtbot.waitSignal(autosave.written):
         document.motion.set_locked(0, True)
     autosave.close(keep=True)
-    (lost,) = find_lost_poses(tmp_path / "sessions")
+    (lost,) = find_recoverable_poses(tmp_path / "sessions")
     assert lost.locked == (0,)
 
 
@@ -301,8 +301,8 @@ def test_a_lock_that_changes_later_is_kept_too(
 def test_sessions_of_living_editors_are_left_alone(tmp_path: Path) -> None:
     folder = tmp_path / "sessions"
     (mine,) = folder.iterdir()
-    assert Session.held(mine) is None
-    assert find_lost_poses(folder) == []
+    assert Session.try_lock(mine) is None
+    assert find_recoverable_poses(folder) == []
     assert mine.is_dir()
 
 
@@ -310,7 +310,7 @@ def test_a_session_without_a_pose_is_cleared_away(tmp_path: Path) -> None:
     session = Session.new(tmp_path)
     session.release()
     (session.folder / "session.json").write_text("{ this is not JSON")
-    assert find_lost_poses(tmp_path) == []
+    assert find_recoverable_poses(tmp_path) == []
     assert list(tmp_path.iterdir()) == []
 
 
@@ -324,7 +324,7 @@ def test_a_recovery_that_fails_keeps_what_there_is(
     (session.folder / "session.json").write_text(
         '{"model": "/no/such/model.safetensors", "pose_name": "kick", "file": null}'
     )
-    (lost,) = find_lost_poses(lost_folder)
+    (lost,) = find_recoverable_poses(lost_folder)
     with qtbot.waitSignal(document.failed):
         autosave.recover(lost)
     assert lost.poses_file.is_file()
@@ -397,8 +397,8 @@ def test_a_killed_editor_loses_no_edit_of_a_motion(
 ) -> None:
     folder = tmp_path / "sessions"
     let_die(EDITOR_OF_MOTION, swing, folder)
-    (lost,) = find_lost_poses(folder)
-    assert (lost.motion, lost.pose_name, lost.why_pose_alone) == (CLIP, f"{CLIP} 7", "")
+    (lost,) = find_recoverable_poses(folder)
+    assert (lost.motion, lost.pose_name, lost.motion_loss_reason) == (CLIP, f"{CLIP} 7", "")
     assert lost.poses_file.stat().st_size < 100_000
 
     autosave = Autosave(document, folder, seconds=1000.0)
@@ -425,7 +425,7 @@ def test_a_killed_editor_loses_no_edit_of_a_motion(
     # Further edits are kept as well, until they are exported.
     timeline.go_to(9)
     assert autosave.close(keep=True)
-    (lost,) = find_lost_poses(folder)
+    (lost,) = find_recoverable_poses(folder)
     assert lost.pose_name == f"{CLIP} 9"
     lost.session.release()
 
@@ -443,7 +443,7 @@ def test_edits_of_several_clips_are_recovered_with_what_was_exported(
     assert Autosave(document, tmp_path / "sessions", seconds=1000.0).close(keep=True)
     timeline.mark_saved()
     document.new_pose()
-    (lost,) = find_lost_poses(tmp_path / "sessions")
+    (lost,) = find_recoverable_poses(tmp_path / "sessions")
     autosave = Autosave(document, tmp_path / "sessions", seconds=1000.0)
     with qtbot.waitSignal(document.tasks.recovered):
         autosave.recover(lost)
@@ -472,7 +472,7 @@ def test_the_motion_of_a_scene_is_recovered_though_another_body_is_open_since(
     assert Autosave(document, tmp_path / "sessions", seconds=1000.0).close(keep=True)
     timeline.mark_saved()
     opened(qtbot, document, swing)
-    (lost,) = find_lost_poses(tmp_path / "sessions")
+    (lost,) = find_recoverable_poses(tmp_path / "sessions")
     autosave = Autosave(document, tmp_path / "sessions", seconds=1000.0)
     with qtbot.waitSignal(document.tasks.recovered):
         autosave.recover(lost)
@@ -500,8 +500,8 @@ def test_the_pose_alone_comes_back_where_the_motion_s_file_is_another(
         swing.touch()
     else:
         swing.write_bytes(swing.read_bytes()[:100])
-    (lost,) = find_lost_poses(tmp_path / "sessions")
-    assert lost.why_pose_alone == f"swing.glb {told}"
+    (lost,) = find_recoverable_poses(tmp_path / "sessions")
+    assert lost.motion_loss_reason == f"swing.glb {told}"
     autosave = Autosave(document, tmp_path / "sessions", seconds=1000.0)
     with qtbot.waitSignal(document.failed) as failed:
         autosave.recover(lost)
@@ -532,10 +532,10 @@ def test_a_motion_of_another_file_that_is_gone_leaves_its_pose(
     assert Autosave(document, tmp_path / "sessions", seconds=1000.0).close(keep=True)
     document.timeline.mark_saved()
     document.new_pose()
-    (lost,) = find_lost_poses(tmp_path / "sessions")
-    assert (lost.motion, lost.why_pose_alone) == ("walk", "")
+    (lost,) = find_recoverable_poses(tmp_path / "sessions")
+    assert (lost.motion, lost.motion_loss_reason) == ("walk", "")
     path.rename(tmp_path / "elsewhere.json")
-    assert lost.why_pose_alone == "walk.json is gone"
+    assert lost.motion_loss_reason == "walk.json is gone"
     autosave = Autosave(document, tmp_path / "sessions", seconds=1000.0)
     with qtbot.waitSignal(document.failed) as failed:
         autosave.recover(lost)
@@ -560,7 +560,7 @@ def test_edits_beyond_the_bound_are_told_of_and_the_pose_is_kept(
     assert f"the motion “{CLIP}” has edits of more than" in failed.args[0].headline
     assert failed.args[0].next_step == "export the motion"
     assert autosave.close(keep=True)
-    (lost,) = find_lost_poses(tmp_path / "sessions")
+    (lost,) = find_recoverable_poses(tmp_path / "sessions")
     assert lost.motion == ""
     (pose,) = read_poses(lost.poses_file, document.model)
     assert pose.latent.tobytes() == motion.codes[20].tobytes()

@@ -11,10 +11,10 @@ from app.view.camera import (
     followed,
     framing,
     places_of,
-    seen_at,
     shifted,
     turn_about,
     turned,
+    unproject,
 )
 
 SIZE = (640.0, 480.0)
@@ -45,11 +45,11 @@ def test_a_point_that_is_dragged_in_the_plane_of_the_picture_is_seen_at_the_poin
     sight = (view.focus - view.position) / np.linalg.norm(view.focus - view.position)
     for point in view.focus + generator.normal(0.0, 0.4, (20, 3)):
         place = tuple(generator.uniform(0.0, 480.0, 2).tolist())
-        there = seen_at(view, place, SIZE, point)
+        there = unproject(view, place, SIZE, point)
         np.testing.assert_allclose(places_of(view, there[None], SIZE)[0], place, atol=1e-9)
         assert (there - point) @ sight == pytest.approx(0.0, abs=1e-12)
         own = tuple(places_of(view, point[None], SIZE)[0].tolist())
-        np.testing.assert_allclose(seen_at(view, own, SIZE, point), point, atol=1e-12)
+        np.testing.assert_allclose(unproject(view, own, SIZE, point), point, atol=1e-12)
 
 
 def test_turning_keeps_the_distance_and_stays_upright_without_going_over_the_top(

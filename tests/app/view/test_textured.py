@@ -237,7 +237,7 @@ def test_a_copy_of_the_scene_looks_like_it(draw: Draw) -> None:
     front = draw(*laid())
     copy = PoseRenderer(front.model, SIDE, SIDE, LIGHT)
     try:
-        copy.scene.look_like(front.scene)
+        copy.scene.copy_from(front.scene)
         shown = np.asarray(copy.drawn())[SIDE // 2 - 30, SIDE // 2 - 30]
     finally:
         copy.close()

@@ -10,7 +10,7 @@ from PIL import Image
 from PySide6.QtWidgets import QApplication, QColorDialog, QDialog, QFileDialog
 from pytestqt.qtbot import QtBot
 
-from app.view.offscreen import TurntableStyle
+from app.view.offscreen import VideoStyle
 from app.view.theme import DARK, LIGHT, apply_theme
 from app.window.dialogs.forms import Form, video_form
 from app.window.main_window import MainWindow
@@ -20,7 +20,7 @@ from tests.app.windows import PATIENCE, answer, choose_file, take_picture
 pytestmark = pytest.mark.one_window
 
 
-def video(qtbot: QtBot, window: MainWindow, path: Path, style: TurntableStyle) -> Path:
+def video(qtbot: QtBot, window: MainWindow, path: Path, style: VideoStyle) -> Path:
     """Make a turntable video, and return the path of the written file."""
     written = path.with_suffix("") if path.suffix == ".png" else path
     with qtbot.waitSignal(
@@ -37,7 +37,7 @@ def test_a_video_goes_round_once_in_the_size_and_the_time_asked_for(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
 ) -> None:
     path = tmp_path / f"turn{suffix}"
-    style = TurntableStyle(seconds=0.5, width=72, height=48, rate=30)
+    style = VideoStyle(seconds=0.5, width=72, height=48, rate=30)
     assert video(qtbot, window, path, style) == path
     with Image.open(path) as image:
         assert (image.size, image.n_frames) == ((72, 48), 15)
@@ -55,7 +55,7 @@ def test_a_video_goes_round_once_in_the_size_and_the_time_asked_for(
 def test_durations_add_up_to_the_turn_in_every_unit() -> None:
     for rate in (7, 24, 25, 30, 48, 60):
         for unit in (1, 10):
-            durations = TurntableStyle(seconds=3.0, rate=rate).durations(unit)
+            durations = VideoStyle(seconds=3.0, rate=rate).durations(unit)
             assert len(durations) == 3 * rate
             assert sum(durations) == 3000
             assert max(durations) - min(durations) <= unit
@@ -65,7 +65,7 @@ def test_durations_add_up_to_the_turn_in_every_unit() -> None:
 def test_a_png_sequence_is_a_folder_of_numbered_pictures(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
-    style = TurntableStyle(seconds=0.4, width=60, height=40, rate=10)
+    style = VideoStyle(seconds=0.4, width=60, height=40, rate=10)
     folder = video(qtbot, window, tmp_path / "turn.png", style)
     assert folder == tmp_path / "turn"
     names = [f"turn_{number:04d}.png" for number in range(1, 5)]
@@ -82,7 +82,7 @@ def test_a_cancelled_png_sequence_leaves_nothing(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
     before = set(tmp_path.iterdir())
-    style = TurntableStyle(seconds=8.0, width=60, height=40)
+    style = VideoStyle(seconds=8.0, width=60, height=40)
     window.viewport.pictures.turntable(tmp_path / "turn.png", style)
     pictures = window.viewport.pictures
     qtbot.waitUntil(lambda: pictures._video.n_drawn > 2, timeout=PATIENCE)
@@ -97,7 +97,7 @@ def test_a_cancelled_png_sequence_leaves_nothing(
 def test_a_transparent_video_shows_nothing_but_the_body(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
 ) -> None:
-    style = TurntableStyle(seconds=0.2, width=60, height=60, rate=10, background="transparent")
+    style = VideoStyle(seconds=0.2, width=60, height=60, rate=10, background="transparent")
     written = video(qtbot, window, tmp_path / f"turn{suffix}", style)
     with Image.open(written / "turn_0002.png" if suffix == ".png" else written) as image:
         alpha = np.asarray(image.convert("RGBA"))[:, :, 3]
@@ -109,7 +109,7 @@ def test_a_transparent_video_shows_nothing_but_the_body(
 def test_one_colour_stands_behind_where_it_is_asked_for(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
 ) -> None:
-    style = TurntableStyle(0.2, 60, 60, 10, background="plain", colour="#20a040")
+    style = VideoStyle(0.2, 60, 60, 10, background="plain", colour="#20a040")
     written = video(qtbot, window, tmp_path / f"turn{suffix}", style)
     with Image.open(written / "turn_0001.png" if suffix == ".png" else written) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
@@ -120,13 +120,13 @@ def test_one_colour_stands_behind_where_it_is_asked_for(
 @pytest.mark.parametrize(
     ("name", "style", "reason"),
     [
-        ("turn.gif", TurntableStyle(background="transparent"), "transparent background"),
-        ("turn.gif", TurntableStyle(rate=60), "a GIF has at most 50"),
-        ("turn.webp", TurntableStyle(20.0, 4096, 4096, 60), "too much for one file"),
+        ("turn.gif", VideoStyle(background="transparent"), "transparent background"),
+        ("turn.gif", VideoStyle(rate=60), "a GIF has at most 50"),
+        ("turn.webp", VideoStyle(20.0, 4096, 4096, 60), "too much for one file"),
     ],
 )
 def test_what_a_format_cannot_hold_is_refused(
-    window: MainWindow, tmp_path: Path, name: str, style: TurntableStyle, reason: str
+    window: MainWindow, tmp_path: Path, name: str, style: VideoStyle, reason: str
 ) -> None:
     with pytest.raises(MeshFileError, match=reason):
         window.viewport.pictures.turntable(tmp_path / name, style)

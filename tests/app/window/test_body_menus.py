@@ -99,14 +99,14 @@ def test_the_menu_opens_again_after_it_is_closed(window: MainWindow) -> None:
         QApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
 
 
-@pytest.mark.parametrize("sharpness", [1.0, 2.0])
-def test_each_camera_has_an_icon_of_its_own(window: MainWindow, sharpness: float) -> None:
+@pytest.mark.parametrize("device_pixel_ratio", [1.0, 2.0])
+def test_each_camera_has_an_icon_of_its_own(window: MainWindow, device_pixel_ratio: float) -> None:
     drawn = []
     for name in CAMERAS:
-        picture = pixmap(f"camera-{name.lower()}", "#102030", 20, sharpness).toImage()
+        picture = pixmap(f"camera-{name.lower()}", "#102030", 20, device_pixel_ratio).toImage()
         drawn.append(np.frombuffer(picture.constBits(), dtype=np.uint8).astype(int))
         action = window.actions_by_key[f"camera-{name.lower()}"]
         assert not action.icon().pixmap(20, 20).toImage().isNull()
     for first in range(6):
         for second in range(first):
-            assert (np.abs(drawn[first] - drawn[second]) > 60).sum() > 30 * sharpness
+            assert (np.abs(drawn[first] - drawn[second]) > 60).sum() > 30 * device_pixel_ratio

@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QDialog, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.editing.recovery import Autosave, find_lost_poses
+from app.editing.recovery import Autosave, find_recoverable_poses
 from app.view.shading import Shading
 from app.window.dialogs.questions import FailureDialog
 from app.window.main_window import MainWindow
@@ -193,7 +193,7 @@ def test_poses_of_a_character_are_saved_and_recovered_with_it(
     assert document.close()
     document.deleteLater()
 
-    (lost,) = find_lost_poses(tmp_path / "sessions")
+    (lost,) = find_recoverable_poses(tmp_path / "sessions")
     after = PoseDocument(open_body(arm_file), library_folder=tmp_path / "library")
     assert [pose.name for pose in after.library.poses] == ["bent"]
     with qtbot.waitSignal(after.tasks.recovered, timeout=PATIENCE):

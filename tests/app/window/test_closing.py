@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QApplication, QDialog, QProgressBar
 from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
-from app.view.offscreen import TurntableStyle
+from app.view.offscreen import VideoStyle
 from app.window.dialogs.questions import FailureDialog
 from app.window.main_window import MainWindow
 from app.work.threads import Failure
@@ -48,7 +48,7 @@ def test_closing_waits_for_what_is_being_exported(window: MainWindow, tmp_path: 
 def test_closing_waits_for_a_video_that_is_being_drawn(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
-    style, asked = TurntableStyle(0.4, 80, 60, 10), []
+    style, asked = VideoStyle(0.4, 80, 60, 10), []
     qtbot.waitUntil(lambda: window.document.motion.frame is not None, timeout=PATIENCE)
     window.viewport.pictures.turntable(tmp_path / "turn.gif", style)
     waiting = answer(lambda box: asked.append(box.text()))

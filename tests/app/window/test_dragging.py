@@ -176,7 +176,7 @@ def test_a_slider_shows_where_contact_holds_it(qtbot: QtBot, body_window: MainWi
     reached = float(document.history.latent[code])
     # The handle stays under the pointer; the number shows the pose's value.
     assert row.slider.number < reached - 0.01
-    assert row.slider.held_at is not None
+    assert row.slider.contact_position is not None
     assert row.field.value() == pytest.approx(reached, abs=1e-3)
     assert document.motion.exact is not None
     assert not document.motion.exact.colliding
@@ -186,7 +186,7 @@ def test_a_slider_shows_where_contact_holds_it(qtbot: QtBot, body_window: MainWi
     assert row.slider.number == pytest.approx(reached, abs=0.01)
     document.history.undo()
     rest(qtbot, body_window)
-    assert row.slider.held_at is None
+    assert row.slider.contact_position is None
     assert "contact" not in body_window.collision.exact.details.text()
 
 

@@ -91,8 +91,8 @@ def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
     for hidden in np.setdiff1d(body.faces[group.faces], drawn)[::7]:
         viewport.mouse.point_at(place_of(viewport, int(hidden)).toPointF())
         assert viewport.mouse.vertex is None or viewport.mouse.vertex in drawn
-    viewport.point_out(group.faces)
-    assert scene.named.n_faces == 0
+    viewport.tint_faces(group.faces)
+    assert scene.selection.n_faces == 0
     take_picture(window, "hidden-mesh")
     pose = window.library._poses[0]
     without = coverage(window.library._picture(pose))

@@ -278,7 +278,7 @@ def test_several_runs_are_looked_at_and_one_is_discarded(watching: MainWindow) -
         folders.append(work)
     hero, villain = folders
     with locked(hero.path / "run"):
-        window.learning.runs.look()
+        window.learning.runs.poll()
         text = window.learning.indicator.text()
         assert text == "Learning hero: 43 %, about 8 minutes left, checking poses (and 1 more)"
         window.actions_by_key["learning"].trigger()
@@ -298,7 +298,7 @@ def test_several_runs_are_looked_at_and_one_is_discarded(watching: MainWindow) -
         assert not villain.path.exists()
     assert not dialog.isVisible()
     hero.remove()
-    window.learning.runs.look()
+    window.learning.runs.poll()
     assert not window.actions_by_key["learning"].isEnabled()
 
 
@@ -311,7 +311,7 @@ def test_a_run_that_nearly_always_collides_offers_the_character_instead(
     sentence = "97 % of the first 1024 samples collide"
     status = LearningStatus(RunState.FAILED, "latent space", 1.0, 0.2, sentence=sentence)
     work.tell(replace(status, model=str(file), mostly_collides=True))
-    window.learning.runs.look()
+    window.learning.runs.poll()
     window.actions_by_key["learning"].trigger()
     dialog = dialog_of(window)
     assert dialog.state.text() == f"{sentence}."
@@ -323,11 +323,11 @@ def test_a_run_that_nearly_always_collides_offers_the_character_instead(
     # The finished part is kept until it is discarded.
     assert work.path.exists()
     work.tell(replace(status, sentence="the disk is full"))
-    window.learning.runs.look()
+    window.learning.runs.poll()
     assert dialog.resume.text().replace("&", "") == "Continue"
     assert not dialog.open_model.isVisible()
     work.remove()
-    window.learning.runs.look()
+    window.learning.runs.poll()
 
 
 def finished(name: str, model: LearnedBody) -> WorkFolder:
@@ -352,7 +352,7 @@ def test_a_card_that_is_being_read_is_given_up_with_its_dialog_and_for_another_r
         LearningDialog, "_on_card", lambda _, path, model: shown.append((path, model))
     )
     hero, villain = finished("hero", editor_model), finished("villain", editor_model)
-    runs.look()
+    runs.poll()
     watching.actions_by_key["learning"].trigger()
     dialog = dialog_of(watching)
     dialog.show_run(hero.path)
@@ -366,7 +366,7 @@ def test_a_card_that_is_being_read_is_given_up_with_its_dialog_and_for_another_r
     asked.release()
     hero.remove()
     villain.remove()
-    runs.look()
+    runs.poll()
     assert len(shown) == 1
 
 
@@ -446,7 +446,7 @@ def test_the_dialog_keeps_its_size_and_does_not_come_back_once_closed(
 
     def tell(stage: str, done: float) -> None:
         work.tell(LearningStatus(RunState.RUNNING, stage, done, done, 480.0))
-        runs.look()
+        runs.poll()
 
     with locked(work.path / "run"):
         tell("poses", 0.1)
@@ -458,11 +458,11 @@ def test_the_dialog_keeps_its_size_and_does_not_come_back_once_closed(
             assert (dialog.width(), dialog.height()) == (800, 780)
         dialog.reject()
     finished("hero", editor_model)
-    runs.look()
+    runs.poll()
     assert watching.learning.indicator.text() == "hero is ready"
     assert not [d for d in watching.findChildren(LearningDialog) if d.isVisible()]
     # Nor in the next window; clicking the indicator shows it again.
-    watching.learning._told.clear()
+    watching.learning._previous_states.clear()
     runs.changed.emit()
     assert not [d for d in watching.findChildren(LearningDialog) if d.isVisible()]
     QTest.mouseClick(watching.learning.indicator, LEFT)

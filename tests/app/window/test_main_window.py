@@ -102,7 +102,7 @@ def test_a_drag_with_a_key_held_is_ten_times_finer(
     slider = window.sliders.row_of(1).slider
     start = handle(window.sliders.row_of(1))
     way, before = 20, slider.place
-    per_pixel = (slider.ends[1] - slider.ends[0]) / (slider.width() - 2 * HANDLE)
+    per_pixel = (slider.value_range[1] - slider.value_range[0]) / (slider.width() - 2 * HANDLE)
     left, no_key = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
     QTest.mousePress(slider, left, key, start)
     for step in range(1, way + 1):

@@ -175,7 +175,7 @@ def test_a_library_is_mirrored_and_back_to_the_bit(
     said = mirror_by_menu(qtbot, window, place)
     assert said == "These mirrored poses are already in your library"
     assert len(document.library.poses) == 4
-    qtbot.waitUntil(lambda: not library._due.isActive(), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not library._thumbnail_timer.isActive(), timeout=PATIENCE)
     rest(qtbot, window)
     take_picture(window, f"mirror_library_{ending}")
     document.history.undo()

@@ -8,7 +8,7 @@ import numpy as np
 from PySide6.QtCore import QTimer
 from pytestqt.qtbot import QtBot
 
-from app.editing.recovery import Autosave, find_lost_poses
+from app.editing.recovery import Autosave, find_recoverable_poses
 from app.window.main_window import MainWindow
 from tests.app.windows import PATIENCE, accept_and_choose, answer, drop
 from tests.smpl_files import motion_arrays, tiny_arrays
@@ -48,7 +48,7 @@ def test_a_motion_shapes_the_body_and_comes_back(
     with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         document.tasks.open_model(model)
     assert document.model.fingerprint == plain.fingerprint
-    (lost,) = find_lost_poses(sessions)
+    (lost,) = find_recoverable_poses(sessions)
     autosave = Autosave(document, sessions, seconds=1000.0)
     with qtbot.waitSignal(document.tasks.recovered, timeout=PATIENCE):
         autosave.recover(lost)

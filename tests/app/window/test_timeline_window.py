@@ -17,7 +17,7 @@ from pytestqt.qtbot import QtBot
 
 from app.benchmarks.brute_force import is_free_by_brute_force
 from app.view.camera import View, sees_all
-from app.view.offscreen import MotionVideo, TurntableStyle
+from app.view.offscreen import MotionVideo, VideoStyle
 from app.view.shading import Shading
 from app.window.dialogs.forms import MotionDialog
 from app.window.main_window import MainWindow
@@ -569,7 +569,7 @@ def test_a_video_of_the_motion_has_its_frames(
     motion = document.timeline.motion
     assert motion is not None
     part = motion.part(range(0, 40, 1)).at_rate(6.0)
-    style = TurntableStyle(len(part) / 6.0, 96, 96, 6, "plain", "#ffffff")
+    style = VideoStyle(len(part) / 6.0, 96, 96, 6, "plain", "#ffffff")
     swinging.viewport.pictures.motion(tmp_path / "swing.gif", style, part)
     qtbot.waitUntil((tmp_path / "swing.gif").exists)
     with Image.open(tmp_path / "swing.gif") as film:
@@ -591,7 +591,7 @@ def test_a_video_shows_what_codes_do_not_hold_of_its_frames(
         for frame, row in enumerate(motion.codes[:3])
     ]
     moved = replace(motion, space_at=lambda time: fatter[int(time)])
-    style = TurntableStyle(0.5, 96, 96, 6, "plain", "#ffffff")
+    style = VideoStyle(0.5, 96, 96, 6, "plain", "#ffffff")
     renderer = swinging.viewport.pictures._copy(96, 96, transparent=False)
     video = MotionVideo(renderer, tmp_path / "moved.gif", style, model, moved.part(range(3)))
     try:

@@ -46,7 +46,7 @@ def runs(qtbot: QtBot, monkeypatch: pytest.MonkeyPatch) -> Iterator[LearningRuns
     monkeypatch.setenv("SECONDS_PER_STEP", "0.05")
     parent = QObject()
     held = LearningRuns(parent)
-    held.begin()
+    held.start_polling()
     yield held
     for run in held.runs:
         held.stop(run.path, discard=True)
@@ -116,7 +116,7 @@ def test_a_run_is_stopped_from_another_window_and_one_waits_for_another(
     second = runs.start(LearningRequest((str(tube_file),), "good"), "villain")
     assert wait_for(qtbot, runs, second, lambda _: True).state == RunState.WAITING
     later = LearningRuns(runs)
-    later.look()
+    later.poll()
     assert [(run.name, run.state) for run in later.runs] == [
         ("hero", RunState.RUNNING),
         ("villain", RunState.WAITING),
@@ -230,7 +230,7 @@ def test_a_state_that_is_not_known_is_one_of_a_run_that_is_stopped(runs: Learnin
     status = work.path / "status.json"
     for state in ("paused", "waiting"):
         status.write_text(status.read_text().replace("running", state))
-        runs.look()
+        runs.poll()
         assert [run.state for run in runs.runs] == [RunState.STOPPED]
         work.tell(LearningStatus(RunState.RUNNING))
 
@@ -247,10 +247,10 @@ def test_a_process_that_went_as_the_disk_filled_up_is_explained_by_that(
 ) -> None:
     work = folder_of("hero", RunState.RUNNING)
     with locked(work.path / "run"):
-        runs.look()
+        runs.poll()
         assert [run.state for run in runs.runs] == [RunState.RUNNING]
     monkeypatch.setattr(learning_runs, "_LEAST_FREE_BYTES", 1 << 62)
-    runs.look()
+    runs.poll()
     (run,) = runs.runs
     assert run.state == RunState.KILLED
     assert run.status.sentence.startswith("the disk is full: ")

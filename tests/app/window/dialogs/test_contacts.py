@@ -158,9 +158,9 @@ def test_joints_count_by_a_tick_and_the_groups_that_are_chosen_are_tinted(
     dialog.first.textActivated.emit(dialog.first.currentText())
     chosen = {dialog.first.currentText(), dialog.second.currentText()}
     groups = [g for groups in body.groups_by_kind.values() for g in groups if g.name in chosen]
-    assert scene.named.n_faces == len(np.unique(np.concatenate([g.faces for g in groups]))) > 0
+    assert scene.selection.n_faces == len(np.unique(np.concatenate([g.faces for g in groups]))) > 0
     dialog.close()
-    assert scene.named.n_faces == 0
+    assert scene.selection.n_faces == 0
 
 
 def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: RigBody) -> None:
@@ -177,7 +177,7 @@ def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: 
     assert heights[0] >= 6 * dialog.ignored.visualItemRect(parts).height()
     assert heights[1] - heights[0] >= 90
     limb = parts.child(names.index("LeftArm"))
-    with qtbot.waitSignal(dialog.faces_named) as named:
+    with qtbot.waitSignal(dialog.faces_selected) as named:
         dialog.ignored.setCurrentItem(limb)
     assert named.args is not None
     (group,) = (group for group in body.character.groups if group.name == "LeftArm")
@@ -291,9 +291,9 @@ def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     item = kinds[0].child(0)
     dialog.ignored.setCurrentItem(item)
     named = next(iter(dialog._pairs))
-    assert scene.named.n_faces == sum(size[name] for name in named)
+    assert scene.selection.n_faces == sum(size[name] for name in named)
     dialog.ignored.setCurrentItem(None)
-    assert scene.named.n_faces == 0
+    assert scene.selection.n_faces == 0
     components = next(kind for text, kind in shown.items() if text.startswith("Components"))
     components.setCheckState(0, Qt.CheckState.Checked)
     ignored = tuple(pair.groups for pair in expected["components"])
@@ -362,14 +362,14 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     # The places are listed and tinted at once.
     scene = window.viewport.scene
     assert scene is not None
-    assert scene.named.n_faces == len(proposed.faces) > 0
+    assert scene.selection.n_faces == len(proposed.faces) > 0
     ((first, second), n), *_ = proposed.places.items()
     assert f"{first} and {second}: {n} place" in card.listed.text()
     assert card.ignore.isVisible()
     rest(qtbot, window)
     take_picture(window, "proposal")
     QTest.mouseClick(card.ignore, LEFT)
-    assert scene.named.n_faces == 0
+    assert scene.selection.n_faces == 0
     qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     rest(qtbot, window)
     assert document.model.rules == proposed.rules
@@ -402,10 +402,10 @@ def test_a_crossing_in_all_frames_of_a_clip_is_offered_until_it_is_answered(
     assert scene is not None
     assert card.isVisible()
     assert card.ignore.isVisible()
-    assert scene.named.n_faces > 0
+    assert scene.selection.n_faces > 0
     take_picture(window, "proposal_of_a_clip")
     QTest.mouseClick(card.dismiss, LEFT)
-    assert (card.isVisible(), scene.named.n_faces) == (False, 0)
+    assert (card.isVisible(), scene.selection.n_faces) == (False, 0)
     qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     # When reopened, it is not offered again; the dialog still has the places.
     with qtbot.waitSignal(document.tasks.rules_proposed, timeout=PATIENCE):

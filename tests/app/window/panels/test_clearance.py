@@ -116,10 +116,10 @@ def test_a_press_shows_where_the_pose_comes_nearest(
     go_to(qtbot, window, colliding)
     scene = window.viewport.scene
     assert scene is not None
-    assert (button.isEnabled(), scene.named.n_faces) == (True, 0)
+    assert (button.isEnabled(), scene.selection.n_faces) == (True, 0)
     before = scene.view
     button.click()
-    assert scene.named.n_faces > 2
+    assert scene.selection.n_faces > 2
     # The camera moves to look at it.
     nearest = window.document.motion.nearest
     assert nearest is not None
@@ -130,11 +130,11 @@ def test_a_press_shows_where_the_pose_comes_nearest(
         lambda: bool(np.linalg.norm(scene.view.focus - middle) < 1e-3 * size), timeout=PATIENCE
     )
     button.click()
-    assert scene.named.n_faces == 0
+    assert scene.selection.n_faces == 0
     button.click()
     # Another pose, which is nowhere near itself.
     go_to(qtbot, window, np.zeros_like(colliding))
-    assert scene.named.n_faces == 0
+    assert scene.selection.n_faces == 0
     assert not button.isChecked()
     nearest = window.document.motion.nearest
     assert button.isEnabled() == (nearest is not None)

@@ -16,7 +16,7 @@ from pytestqt.qtbot import QtBot
 from app.editing.document import PoseDocument
 from app.editing.history import Source
 from app.editing.live_pose import code_name
-from app.view.offscreen import TurntableStyle
+from app.view.offscreen import VideoStyle
 from app.window.main_window import MainWindow
 from app.window.panels.library import THUMBNAIL
 from app.window.panels.prediction import DomainRow
@@ -162,7 +162,7 @@ def test_pictures_that_were_due_while_the_library_was_hidden_are_drawn_when_it_i
     items = [library.list.item(row) for row in range(library.list.count())]
     window.docks["library"].hide()
     library.allow_pictures()
-    qtbot.waitUntil(lambda: not library._due.isActive(), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not library._thumbnail_timer.isActive(), timeout=PATIENCE)
     assert not any(is_drawn(item.icon()) for item in items)
     window.docks["library"].show()
     qtbot.waitUntil(lambda: is_drawn(items[0].icon()), timeout=PATIENCE)
@@ -179,7 +179,7 @@ def test_pictures_of_poses_that_are_not_searched_for_are_not_seen(
     assert names_shown(window) == [name]
     items = [library.list.item(row) for row in range(library.list.count())]
     qtbot.waitUntil(lambda: is_drawn(items[-1].icon()), timeout=PATIENCE)
-    qtbot.waitUntil(lambda: not library._due.isActive(), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not library._thumbnail_timer.isActive(), timeout=PATIENCE)
     window.viewport.setFocus()
     QApplication.processEvents()
     seen = library.list.viewport().grab().toImage()
@@ -206,7 +206,7 @@ def test_escape_stops_a_turntable_that_the_status_bar_tells_of(
 ) -> None:
     cancel = window.actions_by_key["cancel"]
     assert not cancel.isEnabled()
-    window.viewport.pictures.turntable(tmp_path / "turn.gif", TurntableStyle(width=60, height=60))
+    window.viewport.pictures.turntable(tmp_path / "turn.gif", VideoStyle(width=60, height=60))
     assert cancel.isEnabled()
     assert "Making turn.gif…" in told_as_busy(window)
     with qtbot.waitSignal(window.document.message, timeout=PATIENCE) as told:
