@@ -276,12 +276,15 @@ class CollisionDetector:
 
     def without(self, faces: npt.NDArray[np.integer]) -> CollisionDetector:
         """Return a detector whose searches leave out some faces."""
-        other, slots = copy(self), self._tree.slot_face.reshape(-1, LEAF_SIZE)
+        slots = self._tree.slot_face.reshape(-1, LEAF_SIZE)
         corners = self._tree.corners.reshape(-1, 3, LEAF_SIZE).copy()
         corners.transpose(0, 2, 1)[np.isin(slots, faces)] = -1
-        other._tree = self._tree._replace(corners=corners.reshape(-1))
-        # Searchers hold the tree.
-        other._idle, other._gpu = queue.LifoQueue(), None
+        return self._with(_tree=self._tree._replace(corners=corners.reshape(-1)))
+
+    def _with(self, **changes: object) -> CollisionDetector:
+        """Return a copy with other attributes and searchers, which hold tree and exclusions."""
+        other = copy(self)
+        vars(other).update(changes, _idle=queue.LifoQueue(), _gpu=None)
         return other
 
     def with_touching(self, pairs: TouchingGroups) -> CollisionDetector:
@@ -308,20 +311,15 @@ class CollisionDetector:
             other = CollisionDetector(self.topology, self.reference, rules, groups, self.body_size)
             other._nearness, other._may_touch = self._nearness, self._may_touch
             return other
-        other = copy(self)
         exclusions = with_other_rules(
             self._exclusions, rules, self.topology, self.reference, self.body_size, groups
         )
-        vars(other).update(
+        return self._with(
             rules=rules,
             groups=tuple(groups),
             _exclusions=exclusions,
             _uncounted=UncountedTables(self._tree, exclusions),
-            # Searchers hold the exclusions.
-            _idle=queue.LifoQueue(),
-            _gpu=None,
         )
-        return other
 
     def touching_faces(self) -> IntArray:
         """Return the faces of the patches that, by the rules, touch in nearly every pose."""

@@ -22,6 +22,7 @@ from lcollision_core.contact.search import (
     NO_ENERGY,
     NO_TABLES,
     Cells,
+    node_depths,
 )
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.topology import FloatArray, Topology
@@ -102,9 +103,7 @@ class GpuSearch:
         source = np.arange(topology.n_vertices, dtype=np.int32)
         source[topology.unused_vertices] = topology.faces[0, 0]
         inner = np.flatnonzero(tree.left >= 0)
-        depth, last_leaf = np.zeros(len(tree.left), dtype=np.int32), tree.leaf.copy()
-        for node in inner:
-            depth[[tree.left[node], tree.right[node]]] = depth[node] + 1
+        depth, last_leaf = node_depths(tree), tree.leaf.copy()
         for node in inner[::-1]:
             last_leaf[node] = last_leaf[tree.right[node]]
         by_level = np.argsort(depth, kind="stable").astype(np.int32)

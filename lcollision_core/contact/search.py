@@ -256,8 +256,7 @@ def make_uncounted(
     tree, exclusions : of one topology
     keep_going : polled now and then; if it returns False, None is returned
     """
-    depth = np.zeros(len(tree.left), dtype=np.int32)
-    _fill_depths(tree.left, tree.right, depth)
+    depth = node_depths(tree)
     leaves = int(depth[tree.leaf < 0].max(initial=-1)) + 1
     level = np.where(tree.leaf < 0, depth, np.int32(leaves))
     inner = [np.flatnonzero(level == leaf).astype(np.int32) for leaf in range(leaves)]
@@ -298,6 +297,13 @@ def _both_ways(start: npt.NDArray[np.int64], entry: IntArray) -> _SymmetricLists
     return _SymmetricLists(
         start, entry, before.indptr.astype(np.int64), before.indices.astype(np.int32)
     )
+
+
+def node_depths(tree: FaceTree) -> IntArray:
+    """Return the (n,) int32 depth of each node of a tree, 0 for the root."""
+    depth = np.zeros(len(tree.left), dtype=np.int32)
+    _fill_depths(tree.left, tree.right, depth)
+    return depth
 
 
 @compiled
