@@ -61,7 +61,6 @@ from lcollision_core.predictor.network_base import (
 )
 
 if TYPE_CHECKING:
-    from lcollision_core.embedding import Embedding
     from lcollision_core.labels import LabelRows
     from lcollision_core.predictor.config import PredictorConfig
 

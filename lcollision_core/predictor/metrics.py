@@ -16,7 +16,8 @@ from lcollision_core.meshes.topology import FloatArray
 ERROR_BOUNDS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 """Shares of wrong verdicts for which the predictor's sure range is stored."""
 
-_CONFIDENCE = 0.95
+CONFIDENCE = 0.95
+"""Confidence of the intervals, and of the sure ranges."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def _most_errors(n_samples: int, bound: float) -> int | None:
     confirmed, refuted = -1, int(bound * n_samples) + 1
     while refuted - confirmed > 1:
         middle = (confirmed + refuted) // 2
-        if betaincinv(middle + 1, max(n_samples - middle, 1), _CONFIDENCE) <= bound:
+        if betaincinv(middle + 1, max(n_samples - middle, 1), CONFIDENCE) <= bound:
             confirmed = middle
         else:
             refuted = middle
@@ -84,9 +85,6 @@ def _most_errors(n_samples: int, bound: float) -> int | None:
 
 
 CALIBRATION_BINS = 10
-
-CONFIDENCE = 0.95
-"""Confidence of the intervals."""
 
 _PAIRING_SEED = 0
 """Seed of the pairs of RANK, so that equal predictions get equal scores."""
