@@ -394,29 +394,6 @@ class Contacts:
         self.vertices = self.vertices[kept]
 
 
-def nearest_within(
-    metric: FloatArray,
-    centre: FloatArray,
-    low: FloatArray,
-    high: FloatArray,
-    normals: FloatArray,
-    offsets: FloatArray,
-) -> FloatArray | None:
-    """Minimise (Z - centre)^T metric (Z - centre) in half-spaces and bounds.
-
-    Parameters
-    ----------
-    metric : (D, D) positive definite float64 array
-    centre : (D,) float64 array between `low` and `high`, which are equal for a locked code
-    normals, offsets : (C, D) and (C,) float64 arrays: normals Z <= offsets
-
-    Returns
-    -------
-    codes : (D,) float64 array, or None if the half-spaces have no point in common
-    """
-    return least_step(metric, np.zeros_like(centre), centre, low, high, normals, offsets)
-
-
 def least_step(
     hessian: FloatArray,
     gradient: FloatArray,
@@ -428,7 +405,12 @@ def least_step(
 ) -> FloatArray | None:
     """Minimise d^T hessian d / 2 + gradient^T d for codes start + d in half-spaces and bounds.
 
-    Parameters are those of `nearest_within`, with `start` for `centre`, and `gradient` (D,).
+    Parameters
+    ----------
+    hessian : (D, D) positive definite float64 array
+    gradient : (D,) float64 array
+    start : (D,) float64 array between `low` and `high`, which are equal for a locked code
+    normals, offsets : (C, D) and (C,) float64 arrays: normals Z <= offsets
 
     Returns
     -------

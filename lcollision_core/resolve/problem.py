@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing.exact import Contacts, nearest_within
+from lcollision_core.posing.exact import Contacts, least_step
 
 
 class CollisionModel(Protocol):
@@ -108,9 +108,9 @@ class ResolveProblem:
 
     def nearest(self, centre: FloatArray, contacts: Contacts) -> FloatArray | None:
         """Return the pose within all half-spaces nearest to a (D,) pose, None if there is none."""
-        return nearest_within(
-            self.metric, centre, self.low, self.high, contacts.normals, contacts.offsets
-        )
+        half_spaces = contacts.normals, contacts.offsets
+        gradient = np.zeros_like(centre)
+        return least_step(self.metric, gradient, centre, self.low, self.high, *half_spaces)
 
     def excess(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return how far the logits of (B, D) poses exceed the limit, (B,), and (B, D) slopes.

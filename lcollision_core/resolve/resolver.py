@@ -31,7 +31,7 @@ from lcollision_core.resolve.problem import (
     SolverOutcome,
     single_torch_thread,
 )
-from lcollision_core.resolve.solvers import SqpBatch, polish
+from lcollision_core.resolve.solvers import SqpBatch, polish, solve_nlopt
 from lcollision_core.resolve.steps import LeastOverlap, Standing, fall_back, pull_back, step_towards
 
 
@@ -363,8 +363,6 @@ class Ladder:
         if self.options.solver == Solver.SQP:
             batch = SqpBatch(self.problem, start[None], np.array([margin]))
             return batch.run(_ITERATIONS_ALONE)[0]
-        from lcollision_core.resolve.solvers import solve_nlopt
-
         return solve_nlopt(self.problem, Solver(self.options.solver), start, margin)
 
     def _first_free(self, latents: Sequence[FloatArray]) -> FloatArray | None:

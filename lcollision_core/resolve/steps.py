@@ -511,8 +511,7 @@ class Standing:
                 if step.settled or problem.deadline.expired:
                     break
             latent = step.latent.copy()
-        below = self._ground - float((check.decode(latent)[0] @ self.up).min())
-        return _shifted(check, problem, latent, max(0.0, below) * self.up)
+        return self.lifted(check, problem, latent)
 
     def lifted(self, check: ExactCheck, problem: ResolveProblem, latent: FloatArray) -> FloatArray:
         """Return a (D,) pose, free or not, lifted as a whole until nothing is below the ground.

@@ -11,7 +11,7 @@ import pytest
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import Job
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing.exact import nearest_within
+from lcollision_core.posing.exact import least_step
 from lcollision_core.resolve import Metric, ResolveOptions, Solver
 from lcollision_core.resolve.problem import Deadline, ResolveProblem, SolverOutcome
 from lcollision_core.resolve.solvers import SqpBatch, solve_nlopt
@@ -263,7 +263,7 @@ def quadratic(problem: ResolveProblem) -> Callable[[FloatArray], float]:
     return lambda latent: float(problem.distance(latent))
 
 
-def test_nearest_within_half_spaces_agrees_with_a_general_solver() -> None:
+def test_the_least_step_within_half_spaces_agrees_with_a_general_solver() -> None:
     from scipy.optimize import minimize
 
     generator = np.random.default_rng(4)
@@ -277,8 +277,14 @@ def test_nearest_within_half_spaces_agrees_with_a_general_solver() -> None:
         normals = generator.normal(size=(3, size))
         inside = problem.target + generator.uniform(-0.05, 0.05, size)
         offsets = normals @ inside + generator.uniform(0.0, 0.01, 3)
-        nearest = nearest_within(
-            problem.metric, problem.target, problem.low, problem.high, normals, offsets
+        nearest = least_step(
+            problem.metric,
+            np.zeros(size),
+            problem.target,
+            problem.low,
+            problem.high,
+            normals,
+            offsets,
         )
         expected = minimize(
             quadratic(problem),
@@ -303,13 +309,19 @@ def test_half_spaces_without_a_common_point_have_no_nearest() -> None:
     normals = np.stack([NORMAL, -NORMAL])
     bounds = problem.low, problem.high
     offsets = np.array([-1.0, -1.0])
-    assert nearest_within(problem.metric, TARGET, *bounds, normals, offsets) is None
+    assert least_step(problem.metric, np.zeros(4), TARGET, *bounds, normals, offsets) is None
 
 
 def test_without_half_spaces_the_centre_is_nearest() -> None:
     problem = toy_problem(HalfSpace(NORMAL, 0.0), TARGET)
-    nearest = nearest_within(
-        problem.metric, TARGET, problem.low, problem.high, np.empty((0, 4)), np.empty(0)
+    nearest = least_step(
+        problem.metric,
+        np.zeros(4),
+        TARGET,
+        problem.low,
+        problem.high,
+        np.empty((0, 4)),
+        np.empty(0),
     )
     assert nearest is not None
     assert nearest.tolist() == TARGET.tolist()
