@@ -57,7 +57,7 @@ def choose_device(device: Device, note: Callable[[str], None] = _Choice.note) ->
     _Choice.device, _Choice.note, _Choice.in_use = device, note, device is Device.CUDA
 
 
-def takes_gpu(n_poses: int, n_faces: int) -> bool:
+def uses_gpu(n_poses: int, n_faces: int) -> bool:
     """Whether a batch of this size is checked on a GPU."""
     if _Choice.device is Device.CPU or n_poses < _LEAST_POSES:
         return False
@@ -69,7 +69,7 @@ def takes_gpu(n_poses: int, n_faces: int) -> bool:
 
 def block_size(n_poses: int, n_faces: int, otherwise: int) -> int:
     """Return how many poses a loop should check at a time: `otherwise` unless on a GPU."""
-    if not takes_gpu(n_poses, n_faces):
+    if not uses_gpu(n_poses, n_faces):
         return otherwise
     return max(_FEWEST_POSES, min(_MOST_POSES, _MOST_FACES // n_faces))
 

@@ -74,7 +74,7 @@ class LCollisionError(Exception):
         return cls(what, "update the program", where=where)
 
     @classmethod
-    def like(cls, error: LCollisionError, where: str | None = None) -> Self:
+    def from_error(cls, error: LCollisionError, where: str | None = None) -> Self:
         """Make an error of this class from another one, optionally with another `where`."""
         where = error.where if where is None else where
         what, next_step = error.what, error.next_step
@@ -114,7 +114,7 @@ class ModelFileError(LCollisionError):
     """A file cannot be read as a model or as poses of a model, or cannot be written."""
 
 
-class HeldElsewhereError(MeshFileError):
+class FileLockedError(MeshFileError):
     """Another process has locked a file."""
 
 

@@ -57,12 +57,12 @@ def from_json(cls: type[T], values: Any, name: str) -> T:
         bits; or an error that the class itself raises.
     """
     try:
-        return typed(cls, _storable(values, name), name)
+        return convert_checked(cls, _sanitised(values, name), name)
     except RecursionError as error:
         raise ValueError(f"{name} is nested too deeply") from error
 
 
-def typed(cls: type[T], values: Any, name: str) -> T:
+def convert_checked(cls: type[T], values: Any, name: str) -> T:
     """Do as `from_json`, without its check for numbers that are not finite and lone surrogates."""
     try:
         return convert(values, cls)
@@ -84,15 +84,15 @@ def quoted(value: object) -> str:
     return text if len(text) <= _QUOTED_LENGTH else f"{text[: _QUOTED_LENGTH - 3]}..."
 
 
-def _storable(value: Any, name: str) -> Any:
+def _sanitised(value: Any, name: str) -> Any:
     """Return a value whose strings can all be printed; refuse numbers beyond 64 bits."""
     if isinstance(value, str):
         # A lone surrogate, from an undecodable file name, cannot be printed.
         return value.encode(errors="replace").decode()
     if isinstance(value, Mapping):
-        return {key: _storable(item, f"{name}.{key}") for key, item in value.items()}
+        return {key: _sanitised(item, f"{name}.{key}") for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_storable(item, name) for item in value]
+        return [_sanitised(item, name) for item in value]
     if isinstance(value, int | float) and not abs(value) < _BEYOND[type(value)]:
         raise ValueError(f"{name} must be a finite number of 64 bits, got {quoted(value)}")
     return value

@@ -136,7 +136,7 @@ def write_model_file(path: str | os.PathLike[str], sections: Mapping[str, Sectio
         with atomic_write(path) as file:
             file.write(encoded)
     except MeshFileError as error:
-        raise ModelFileError.like(error) from error
+        raise ModelFileError.from_error(error) from error
 
 
 def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:

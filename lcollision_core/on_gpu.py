@@ -37,17 +37,17 @@ _MOST_ROWS = 65535
 
 
 def device_function(
-    function: Callable[..., Any], **instead: Callable[..., Any]
+    function: Callable[..., Any], **replacements: Callable[..., Any]
 ) -> Callable[..., Any]:
     """Compile for the GPU a function that `lcollision_core.compiled` has compiled for the CPU.
 
-    The compiled functions that it calls follow, except those that `instead` replaces by name.
+    The compiled functions that it calls follow, except those that `replacements` replaces by name.
     """
     source = function.py_func  # type: ignore[attr-defined]
-    called = instead | {
+    called = replacements | {
         name: device_function(value)
         for name in source.__code__.co_names
-        if name not in instead and hasattr(value := source.__globals__.get(name), "py_func")
+        if name not in replacements and hasattr(value := source.__globals__.get(name), "py_func")
     }
     plain_function = FunctionType(
         source.__code__, {**source.__globals__, **called}, source.__name__

@@ -81,13 +81,13 @@ def require_limits(values: Any) -> None:
     cls: Any = type(values)
     for name, (_, limits) in limits_of(cls).items():
         value = getattr(values, name)
-        if value is not None and (expected := _not_met(value, limits)):
+        if value is not None and (expected := _violated_condition(value, limits)):
             field_name = f"the {name.replace('_', ' ')}" if isinstance(limits, Option) else name
             got = f"{value:g}" if isinstance(value, float) else value
             raise LCollisionError.must_be(field_name, expected, got)
 
 
-def _not_met(value: Any, limits: Limits) -> str:
+def _violated_condition(value: Any, limits: Limits) -> str:
     """Return the condition that a value violates, or an empty string."""
     if isinstance(limits, Option) and (limits.choices or limits.words):
         allowed: tuple[Any, ...] = limits.choices or tuple(range(len(limits.words)))
@@ -104,7 +104,7 @@ def _not_met(value: Any, limits: Limits) -> str:
     return next((expected for expected, is_met in met.items() if not is_met), "")
 
 
-class Draws(StrEnum):
+class SampleDistribution(StrEnum):
     """Distribution of samples: the latent box alone, as in the paper, or mixed.
 
     Of mixed samples, half are drawn from the box; a quarter are blends of training poses with

@@ -26,8 +26,8 @@ import numpy as np
 from app.benchmarks.timing import Row
 from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.kept_contacts import contacts_of
-from lcollision_core.bodies.known import open_character
 from lcollision_core.bodies.motions import read_motions
+from lcollision_core.bodies.remembered import open_character
 from lcollision_core.bodies.retargeting import Retargeting, bvh_of
 from lcollision_core.built_in_body.body_set import Template, build_template, joint_angles
 from lcollision_core.built_in_body.figure import Arm, Figure, Foot

@@ -183,7 +183,7 @@ def _places_on_rig(model: Body, space: RigPoseSpace) -> dict[str, int]:
 
 def _other_limbs(limbs: Limbs, grip: Grip) -> list[npt.NDArray[np.intp]]:
     """Return the vertices of each limb that neither carries a patch nor hangs on one that does."""
-    held_joints = set(limbs.path(limbs.holding(grip.vertices, grip.weights)))
+    held_joints = set(limbs.path(limbs.held_segment(grip.vertices, grip.weights)))
     tops = limbs.tops[limbs.leads]
     return [np.flatnonzero(tops == top) for top in np.unique(tops) if top not in held_joints]
 

@@ -43,7 +43,7 @@ import numpy.typing as npt
 
 from app.benchmarks.detection import contacts_of_fcl, missing_peers
 from app.benchmarks.timing import Row, median_seconds
-from lcollision_core.bodies import LearnedBody, judge_poses
+from lcollision_core.bodies import LearnedBody, check_poses
 from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.predictor import CollisionPredictor
@@ -105,7 +105,7 @@ def _time_exact(
     # Compiling and building the trees are not timed.
     first = model.decode(latent[:BATCH])
     detector.are_colliding(first[:8])
-    judge_poses(model, latent[:8], ERROR_BOUND)
+    check_poses(model, latent[:8], ERROR_BOUND)
     decode = check = hybrid = 0.0
     n_colliding = n_estimated = n_wrong = 0
     for start in range(0, len(latent), BATCH):
@@ -116,7 +116,7 @@ def _time_exact(
         decoded = time.perf_counter()
         colliding = detector.are_colliding(vertices)
         checked = time.perf_counter()
-        verdicts = judge_poses(model, part, ERROR_BOUND)
+        verdicts = check_poses(model, part, ERROR_BOUND)
         hybrid += time.perf_counter() - checked
         decode += decoded - began
         check += checked - decoded

@@ -38,11 +38,11 @@ def edit(
     Options of contact rules change those of the character, which keeps them: see `contacts`.
     """
     from app.window.editor import open_editor
-    from lcollision_core.tasks.scenes import beside_each_other, is_scene_file, kept_scene
+    from lcollision_core.tasks.scenes import is_scene_file, kept_scene, scene_of_files
 
     file = files[0] if files else None
     if files and len(files) > 1:
-        file, model_name = None, str(kept_scene(beside_each_other(files)))
+        file, model_name = None, str(kept_scene(scene_of_files(files)))
     elif file is not None and is_scene_file(file):
         file, model_name = None, str(file)
     if file is not None and not file.is_file() and not file.is_dir():

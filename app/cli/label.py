@@ -18,7 +18,7 @@ from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError
-from lcollision_core.options import Draws
+from lcollision_core.options import SampleDistribution
 from lcollision_core.tasks.words import counted
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def label(
         int, typer.Option(min=0, metavar="S", help="The same seed gives the same rows.")
     ] = 0,
     draws: Annotated[
-        Draws | None,
+        SampleDistribution | None,
         typer.Option(
             help="What to sample: only the latent box, as in the paper, or mixed: half from it, "
             "half blends, mixed parts and poses near the collision boundary. Default: as in "
@@ -92,7 +92,7 @@ def label(
     if count is None:
         _check(model, output, as_json)
         return
-    wanted_draws = draws or LabelStore.draws_of(output, Draws.BOX)
+    wanted_draws = draws or LabelStore.draws_of(output, SampleDistribution.BOX)
     labeller = model.labeller(wanted_draws)
     started = time.monotonic()
     try:

@@ -55,7 +55,7 @@ def mirror(
         for source, mirrored in mirrored_of.items():
             tell(f"{source}: {mirrored_text(mirrored)}")
         note_rules(model)
-    colliding = [source for source, mirrored in mirrored_of.items() if mirrored.lost_freedom]
+    colliding = [source for source, mirrored in mirrored_of.items() if mirrored.collides_newly]
     if colliding:
         offer = (
             f"run `lcollision resolve {model_name} {output}` or change them"

@@ -129,7 +129,7 @@ def _being_learned(name_or_path: str) -> dict[str, Any] | None:
     work = WorkFolder(path)
     if path.exists() or not work.path.is_dir():
         return None
-    status, running = asdict(work.status), work.is_held
+    status, running = asdict(work.status), work.is_locked
     return {"name": work.name, "learning": {**status, "running": running}}
 
 

@@ -77,7 +77,7 @@ def new(
                 + "the same command with --regardless trains the predictor anyway; with "
                 "--leave-out or --ignore, fewer contacts count"
             )
-        if not work.poses.exists() and not work.is_held:
+        if not work.poses.exists() and not work.is_locked:
             work.remove()
         raise
     work.remove()

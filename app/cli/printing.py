@@ -54,7 +54,7 @@ def print_figure(
     grown together.
     """
     from lcollision_core.tasks.exporting import refuse_to_replace, source_files
-    from lcollision_core.tasks.inputs import read_given
+    from lcollision_core.tasks.inputs import read_input_poses
     from lcollision_core.tasks.printing import print_pose, require_print
     from lcollision_core.tasks.scenes import open_scene
 
@@ -62,7 +62,7 @@ def print_figure(
     model = open_scene(model_name, NO_SCENE).with_options(rules)
     refuse_to_replace([output], [pose, *source_files(model)])
     with cancel_on_interrupt() as job, progress_bar("Making a solid", job) as job:
-        given, _ = read_given(model, [pose], scale, job.part())
+        given, _ = read_input_poses(model, [pose], scale, job.part())
         if not given:
             raise typer.Exit(ExitStatus.BAD_INPUT)
         matching = [given_pose.pose for given_pose in given if name in (None, given_pose.pose.name)]

@@ -195,7 +195,7 @@ def resolve(
     either. Where joints turn, what a player shows between frames differs a little from that:
     --substeps of its poses are looked at as well.
     """
-    from lcollision_core.bodies.partners import following
+    from lcollision_core.bodies.partners import with_joint_map
     from lcollision_core.tasks.exporting import output_named
     from lcollision_core.tasks.inputs import holds_motion
     from lcollision_core.tasks.resolving import (
@@ -223,7 +223,7 @@ def resolve(
     if joints is not None:
         if scheduler:
             refuse_given(context, ("joints",), "is for motions resolved here", "leave it out")
-        model = following(model, joints)
+        model = with_joint_map(model, joints)
     model = model.with_options(rules).with_touching(touch or ())
     options = replace(
         options,
@@ -278,9 +278,9 @@ def _resolve_poses(
         require_request,
         source_files,
     )
-    from lcollision_core.tasks.inputs import mesh_files_of, read_given
+    from lcollision_core.tasks.inputs import mesh_files_of, read_input_poses
     from lcollision_core.tasks.resolving import resolve_poses
-    from lcollision_core.tasks.scenes import given_of_scene
+    from lcollision_core.tasks.scenes import read_scene_poses
 
     body, output, export = request.body, request.output, request.export
     scene = as_scene(body)
@@ -297,9 +297,9 @@ def _resolve_poses(
         require_one_mesh(output, len(files))
     with progress_bar("Reading poses") as job:
         if scene is not None:
-            given = given_of_scene(scene, files, scale, job)
+            given = read_scene_poses(scene, files, scale, job)
         else:
-            given, failed = read_given(body, files, scale, job)
+            given, failed = read_input_poses(body, files, scale, job)
     if not given:
         raise typer.Exit(ExitStatus.BAD_INPUT)
     require_one_mesh(output, len(given))

@@ -179,7 +179,7 @@ def predictor(
     predictor ...`.
     """
     from lcollision_core.bodies import LearnedBody, checkpoint_path, model_destination, save_trained
-    from lcollision_core.bodies.judging import CARD_POSES
+    from lcollision_core.bodies.scoring import CARD_POSES
     from lcollision_core.files import file_stamp, require_writable
     from lcollision_core.predictor import PRESETS, has_begun, patches_path
     from lcollision_core.tasks.learning import learn_predictor
@@ -217,7 +217,7 @@ def predictor(
                 "back to and may leave poses colliding"
             )
         with progress_bar("Judging kinds of poses") as job:
-            learned = learned.judged(CARD_POSES, 0, job)
+            learned = learned.with_scores(CARD_POSES, 0, job)
         written, trained = save_trained(destination, before, model, learned.of), learned.predictor
         note_if_beside(written, destination)
         checkpoint.unlink(missing_ok=True)

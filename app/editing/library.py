@@ -184,11 +184,11 @@ class Library(QObject):
         ----------
         old : the present name of the pose, "" for a new one
         """
-        from lcollision_core.bodies import MAX_POSE_NAME_LENGTH, why_no_name
+        from lcollision_core.bodies import MAX_POSE_NAME_LENGTH, name_error
 
         if not name:
             return ModelFileError("a pose needs a name", "type one")
-        if why_no_name(name):
+        if name_error(name):
             what = f"a name has at most {MAX_POSE_NAME_LENGTH} characters"
             return ModelFileError(what, "choose a shorter one")
         holder = self.name_taken_by(name)

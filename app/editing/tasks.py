@@ -635,7 +635,7 @@ class Tasks(QObject):
             after = replace(after, outcome_seconds=image.resolution.seconds)
         history.push("Mirror", after)
         sentences = [heading(mirrored_text(image))]
-        if image.lost_freedom and image.resolution is not None and image.resolution.note:
+        if image.collides_newly and image.resolution is not None and image.resolution.note:
             sentences.append(image.resolution.note)
         if self._motion.locked_domains and not image.restored:
             sentences.append("locked parts were mirrored too")
@@ -660,7 +660,7 @@ class Tasks(QObject):
             sentences.append(f"off by at most {height_text(worst)} of the body size")
             for count, words in (
                 (sum(i.pairs_after == 0 < i.pairs_mirrored for _, i in images), "resolved"),
-                (sum(i.lost_freedom for _, i in images), "colliding, though free before"),
+                (sum(i.collides_newly for _, i in images), "colliding, though free before"),
             ):
                 if count:
                     sentences.append(f"{count} {words}")
@@ -709,7 +709,7 @@ class Tasks(QObject):
     def decline_offer(self) -> None:
         """Don't offer the proposed rules again for this character."""
         self.offers_rules = False
-        from lcollision_core.bodies.known import remember_offer_declined
+        from lcollision_core.bodies.remembered import remember_offer_declined
 
         job = as_task(remember_offer_declined, self._model)
         self.start(Work.PROPOSE_RULES, "Keeping the answer", job, lambda _: None)

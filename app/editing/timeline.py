@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from app.editing.tasks import Tasks
     from app.work.frames import PoseFrame
     from lcollision_core.bodies import Body
-    from lcollision_core.bodies.partners import Followed, JointMatch
+    from lcollision_core.bodies.partners import JointMap, JointMatch
     from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion, ResolvedMotion
     from lcollision_core.options import MotionOptions
@@ -438,7 +438,7 @@ class Timeline(QObject):
         done = partial(self._on_clip, enters)
         self._choosing = self._reading.start(f"Reading {name}", job, done)
 
-    def choose_joints(self, followed: Followed) -> None:
+    def choose_joints(self, followed: JointMap) -> None:
         """Remember which joint of the body follows which, and read the motions again."""
         assert self.joints is not None
         assert self.joints_of is not None

@@ -429,7 +429,7 @@ def handles_of(space: PoseSpace) -> list[Handle]:
         middle = rest[inside].mean(axis=0)
         vertex = int(inside[np.linalg.norm(rest[inside] - middle, axis=1).argmin()])
         grip = Grip(vertex, 0.0, inside, np.full(len(inside), 1.0 / len(inside)))
-        is_root = limbs.holding(grip.vertices, grip.weights) == limbs.root
+        is_root = limbs.held_segment(grip.vertices, grip.weights) == limbs.root
         most = _SMALL_ROOT if is_root else _SMALL
         handles.append(Handle(domain, grip, float(areas[domain]), most))
     return handles
@@ -741,7 +741,7 @@ class Mouse(QObject):
         self.hinted.emit(" · ".join((*_HINTS, *(_WHOLE_BODY_HINT,) * (not self.whole_body_drag))))
         self._canvas.setCursor(Qt.CursorShape.ClosedHandCursor)
         limbs = document.model.space.limbs
-        moving = limbs.carried(limbs.holding(grip.vertices, grip.weights), 2.0 * grip.radius)
+        moving = limbs.carried(limbs.held_segment(grip.vertices, grip.weights), 2.0 * grip.radius)
         body_size = document.model.body_size
         drag_target = DragTarget(
             scene.view,

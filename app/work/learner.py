@@ -157,7 +157,7 @@ class _Start:
 
     def withdraw(self) -> None:
         """Delete the request of a run that ended before it began."""
-        if not self._is_taken and not self._work.is_held:
+        if not self._is_taken and not self._work.is_locked:
             with suppress(OSError):
                 (self._work.path / WANTED).unlink(missing_ok=True)
 
@@ -166,15 +166,15 @@ def _tell_failure(work: WorkFolder, sentence: str) -> None:
     """Store why the run failed, unless another process holds it or the disk is full."""
     from lcollision_core.errors import MeshFileError
 
-    if not work.is_held:
+    if not work.is_locked:
         with suppress(MeshFileError):
             failed = replace(work.status, state=RunState.FAILED, sentence=sentence)
-            work.tell(replace(failed, seconds_left=None))
+            work.write_status(replace(failed, seconds_left=None))
 
 
 def _clean_up(work: WorkFolder) -> None:
     """Delete the stop request, and the whole work folder if the request discards it."""
-    if work.is_held:
+    if work.is_locked:
         # The request is for the other process.
         return
     with suppress(OSError):

@@ -148,7 +148,7 @@ class LearningRuns(QObject):
         """
         run = self.run_of(path)
         if run is not None and run.status.mostly_collides:
-            run.work.go_on_regardless()
+            run.work.allow_mostly_colliding()
         try:
             (path / STOP).unlink(missing_ok=True)
             (path / WANTED).touch()
@@ -166,7 +166,7 @@ class LearningRuns(QObject):
         run = self.run_of(path)
         try:
             (path / WANTED).unlink(missing_ok=True)
-            if self._is_starting(path) or (run is not None and run.work.is_held):
+            if self._is_starting(path) or (run is not None and run.work.is_locked):
                 (path / STOP).write_text(DISCARD if discard else "", encoding="utf-8")
             elif discard and run is not None:
                 run.work.remove()
@@ -191,7 +191,7 @@ class LearningRuns(QObject):
 
     def _looked_at(self, work: WorkFolder) -> LearningRun:
         # In this order, a run that starts or ends meanwhile is seen in its earlier state.
-        is_wanted, stops, is_held = (work.path / WANTED).exists(), _is_to_stop(work), work.is_held
+        is_wanted, stops, is_held = (work.path / WANTED).exists(), _is_to_stop(work), work.is_locked
         status = work.status
         state, sentence = status.state, ""
         if is_held or (stops and self._is_starting(work.path)):
@@ -211,7 +211,7 @@ class LearningRuns(QObject):
 
     def _is_gone(self, work: WorkFolder) -> bool:
         """Remove a discarded run that no process holds; return whether it was removed."""
-        if not _is_to_stop(work, DISCARD) or work.is_held or self._is_starting(work.path):
+        if not _is_to_stop(work, DISCARD) or work.is_locked or self._is_starting(work.path):
             return False
         work.remove()
         return True
@@ -227,7 +227,7 @@ class LearningRuns(QObject):
             return
         path, give_up = self._starting
         run = next((run for run in runs if run.path == path), None)
-        has_begun = run is None or run.work.is_held or not (path / WANTED).exists()
+        has_begun = run is None or run.work.is_locked or not (path / WANTED).exists()
         if has_begun and not (path / STOP).exists():
             self._starting = None
         elif time.monotonic() > give_up:
@@ -258,7 +258,7 @@ def _tell_not_begun(work: WorkFolder) -> None:
     """Mark a run as failed because its process did not start."""
     with suppress(OSError, LCollisionError):
         sentence = _NOT_BEGUN.format(work.log)
-        work.tell(replace(work.status, state=RunState.FAILED, sentence=sentence))
+        work.write_status(replace(work.status, state=RunState.FAILED, sentence=sentence))
         for name in (WANTED, STOP):
             (work.path / name).unlink(missing_ok=True)
 

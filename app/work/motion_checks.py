@@ -11,7 +11,7 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body
     from lcollision_core.jobs import Job
-    from lcollision_core.meshes.contact_rules import LeftOut
+    from lcollision_core.meshes.contact_rules import ExcludedPairs
     from lcollision_core.motion import Motion
 
 FloatArray = npt.NDArray[np.float64]
@@ -31,7 +31,7 @@ class MotionChecks:
     checked_between : (T,) bool array
     estimate : (T,) float64 array, the estimated probability of a collision; NaN until predicted
     excluded : (T, R) int64 array, pairs that each contact rule leaves out, see `RuleCounts`, in
-        every n-th frame: see `LeftOut.step_for`
+        every n-th frame: see `ExcludedPairs.step_for`
     excluded_deepest : (T,) float64 array, the deepest of these, normalised
     """
 
@@ -69,12 +69,12 @@ class MotionChecks:
         )
 
     @property
-    def left_out(self) -> LeftOut:
+    def left_out(self) -> ExcludedPairs:
         """Pairs that the contact rules leave out of the checked frames."""
-        from lcollision_core.meshes.contact_rules import LeftOut, RuleCounts
+        from lcollision_core.meshes.contact_rules import ExcludedPairs, RuleCounts
 
         n = len(self.deepest)
-        left_out = LeftOut(step=LeftOut.step_for(n))
+        left_out = ExcludedPairs(step=ExcludedPairs.step_for(n))
         for frame in range(0, n, left_out.step):
             if np.isnan(self.deepest[frame]):
                 continue
@@ -116,10 +116,10 @@ def check_motion(
     job: Job,
 ) -> None:
     """Check the unchecked frames of a motion, and write the results into `checks`."""
-    from lcollision_core.meshes.contact_rules import LeftOut
+    from lcollision_core.meshes.contact_rules import ExcludedPairs
 
     check, n = model.exact_check(), len(motion)
-    step = LeftOut.step_for(n)
+    step = ExcludedPairs.step_for(n)
     owners = check.space.vertex_domain[model.faces[:, 0]]
     if model.has_predictor:
         for start in range(0, n, 256):

@@ -11,7 +11,7 @@ import argparse
 
 import torch
 
-from lcollision_core.bodies import LearnedBody, judge_poses
+from lcollision_core.bodies import LearnedBody, check_poses
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("model", help="a model with a predictor")
@@ -38,5 +38,5 @@ for step in range(arguments.steps + 1):
     optimiser.step()
     if step % 50 == 0:
         poses = (mean + deviation * codes.detach()).numpy()
-        share = judge_poses(model, poses).colliding.mean()
+        share = check_poses(model, poses).colliding.mean()
         print(f"step {step}: likeness {likeness.item():.3f}, {100 * share:.0f} % collide (checked)")

@@ -17,25 +17,6 @@ from lcollision_core.bodies.export import (
     write_pose,
     write_sequence,
 )
-from lcollision_core.bodies.judging import (
-    PoseKind,
-    ProposedRules,
-    Verdicts,
-    estimated_free,
-    judge_poses,
-    propose_rules,
-    sample_poses,
-    score_kinds,
-    typical_poses,
-)
-from lcollision_core.bodies.known import (
-    character_of_mesh,
-    open_body,
-    remember_choices,
-    remember_file,
-    remember_roles,
-    remember_up,
-)
 from lcollision_core.bodies.learned_body import (
     LearnedBody,
     ListedModel,
@@ -66,17 +47,36 @@ from lcollision_core.bodies.poses import (
     PoseFile,
     PoseLibrary,
     encode_mesh,
+    name_error,
     name_of_file,
     read_model_mesh,
     read_pose_file,
     read_poses,
     user_poses_folder,
-    why_no_name,
     with_detail,
     write_poses,
 )
+from lcollision_core.bodies.remembered import (
+    character_of_mesh,
+    open_body,
+    remember_choices,
+    remember_file,
+    remember_roles,
+    remember_up,
+)
 from lcollision_core.bodies.rig_body import RigBody, poses_by_rig, rest_pose_set
 from lcollision_core.bodies.scene_body import SceneBody, as_scene
+from lcollision_core.bodies.scoring import (
+    PoseKind,
+    ProposedRules,
+    Verdicts,
+    check_poses,
+    estimated_free,
+    propose_rules,
+    sample_poses,
+    score_kinds,
+    typical_poses,
+)
 from lcollision_core.options import ExportAxes, ExportRequest
 
 LearnedBody = LearnedBody

@@ -46,7 +46,7 @@ from lcollision_core.model_file import (
     required_array,
     write_model_file,
 )
-from lcollision_core.options import Draws
+from lcollision_core.options import SampleDistribution
 
 if TYPE_CHECKING:
     from lcollision_core.files.scene.appearance import Appearance
@@ -393,7 +393,7 @@ class LearnedBody(Body):
 
         return LatentPoseSpace(self.embedding)
 
-    def labeller(self, draws: Draws = Draws.BOX) -> Labeller:
+    def labeller(self, draws: SampleDistribution = SampleDistribution.BOX) -> Labeller:
         """Return a labeller, which draws samples and labels them by the model's contact rules."""
         from lcollision_core.labels import Labeller
 

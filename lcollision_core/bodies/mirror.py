@@ -193,7 +193,7 @@ class Symmetry:
         image: FloatArray = np.asarray(points) @ self.flip[:3, :3] + self.flip[:3, 3]
         return image
 
-    def image(self, vertices: npt.NDArray[Any]) -> FloatArray:
+    def mirror_vertices(self, vertices: npt.NDArray[Any]) -> FloatArray:
         """Reflect (V, 3) vertices and permute them by `partner`: (V, 3)."""
         return self.reflect(np.asarray(vertices, dtype=np.float64)[self.partner])
 
@@ -203,7 +203,7 @@ class Symmetry:
         moved = self.reflect(placement.apply(shift))
         return RigidTransform(flip @ placement.rotation @ flip, moved, placement.scale)
 
-    def image_of_pin(self, pin: Pin) -> Pin:
+    def mirror_pin(self, pin: Pin) -> Pin:
         """Return the pin on the partner's patch at the mirrored position."""
 
         def image(place: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -267,7 +267,7 @@ class MirroredPose:
     source: MirrorSource
 
     @property
-    def lost_freedom(self) -> bool:
+    def collides_newly(self) -> bool:
         """Whether a collision-free pose became a colliding one."""
         return self.pairs_before == 0 < self.pairs_after
 
@@ -342,7 +342,7 @@ class PoseMirror:
         check = replace(self.check, placement=placement)
         decoded = check.decode(pose)[0]
         pairs_before = len(check.find(check.exported(decoded)).pairs)
-        image = self.symmetry.image(decoded * size) / size
+        image = self.symmetry.mirror_vertices(decoded * size) / size
         image_placement = None if placement is None else self.symmetry.image_of_placement(placement)
         restored = source is not None and source.is_of(pose, placement)
         if source is not None and restored:
@@ -389,7 +389,7 @@ class PoseMirror:
         latent, mirrored : (D,) codes of a pose and of its mirrored pose
         off : (V, 3) offsets from the mirror image's vertices to the mirrored pose's
         """
-        distances: FloatArray = np.linalg.norm(off[self.check.space.topology.picked], axis=1)
+        distances: FloatArray = np.linalg.norm(off[self.check.space.topology.used_index], axis=1)
         return distances
 
     def codes_of_image(
@@ -432,7 +432,7 @@ class PoseMirror:
         latent : (D,) float64 array
         """
         size = self.check.body_size
-        image = self.symmetry.image(self.check.decode(latent)[0] * size) / size
+        image = self.symmetry.mirror_vertices(self.check.decode(latent)[0] * size) / size
         mirrored = self.codes_of_image(latent, image, job)
         other = self.partner(domain)
         other_codes = self.check.space.codes_of([] if other is None else [other])

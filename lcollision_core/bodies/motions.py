@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.export import shapes_in_file, source_for
 from lcollision_core.bodies.kept_contacts import contacts_of
-from lcollision_core.bodies.known import open_body
 from lcollision_core.bodies.poses import read_poses
+from lcollision_core.bodies.remembered import open_body
 from lcollision_core.bodies.retargeting import (
     Retargeting,
-    carried_motions,
+    retargeted_motions,
     rig_space_of,
     skeleton_notes,
 )
@@ -151,7 +151,7 @@ def motion_of_smpl(body: Body, path: Path, fps: float | None = None) -> Motion:
         turns[:, joint] = motion.turns[:, number]
     turns[:, 0] = (Rotation.from_matrix(frame) * Rotation.from_rotvec(turns[:, 0])).as_rotvec()
     pelvis = space.rig.rest[0, :3, 3]
-    codes = space.codes_of_turns(turns, (pelvis + motion.places) @ frame.T - pelvis)
+    codes = space.codes_of_rotations(turns, (pelvis + motion.places) @ frame.T - pelvis)
     times = np.arange(len(motion)) / (fps or motion.rate or NOMINAL_RATE)
     return Motion(path.stem, times, space.unwound(codes), source=path.name)
 
@@ -180,7 +180,7 @@ def write_smpl(
     turns, places = motion.turns[list(frames)], motion.places[list(frames)]
     pelvis = space.rig.rest[0, :3, 3]
     for row, pose in enumerate(codes):
-        own_turns, shift = space.turns_of(pose)
+        own_turns, shift = space.rotations_of(pose)
         own_turns[0] = (
             Rotation.from_matrix(frame.T) * Rotation.from_rotvec(own_turns[0])
         ).as_rotvec()
@@ -269,10 +269,10 @@ def read_motions(
     suffix = path.suffix.lower()
     if suffix not in SCENE_SUFFIXES and clip is not None:
         raise MeshFileError("has no clips to choose from", "leave out the clip", where=path)
-    if is_carried(body, path):
+    if is_retargeted(body, path):
         return [
             replace(motion, contacts=_contacts(body, path, motion, retargeting, fps))
-            for motion, retargeting in carried_motions(body, path, clip, fps)
+            for motion, retargeting in retargeted_motions(body, path, clip, fps)
         ]
     if is_smpl_motion(path):
         return [motion_of_smpl(body, path, fps)]
@@ -337,7 +337,7 @@ def is_of_skeleton(path: Path) -> bool:
     return path.suffix.lower() in SKELETON_SUFFIXES or is_smpl_motion(path)
 
 
-def is_carried(body: Body, path: Path) -> bool:
+def is_retargeted(body: Body, path: Path) -> bool:
     """Whether a file's motions are of another skeleton, which the joints of a body follow.
 
     Includes scenes with another rig than the body's, or without a rig and with other faces.
@@ -365,7 +365,7 @@ def is_carried(body: Body, path: Path) -> bool:
 
 
 _CARRIED: dict[tuple[str, Path, FileStamp | None], bool] = {}
-"""Cached results of `is_carried`, which may take seconds and is called repeatedly."""
+"""Cached results of `is_retargeted`, which may take seconds and is called repeatedly."""
 
 _MOST_KNOWN = 1000
 
@@ -393,7 +393,7 @@ def body_of_motion(body: Body, path: Path) -> tuple[Body, tuple[str, ...]]:
     ------
     MeshFileError : a skeleton's file is damaged; also see `body_of_smpl`.
     """
-    if is_carried(body, path):
+    if is_retargeted(body, path):
         return body, skeleton_notes(body, path)
     return body_of_smpl(body, path) if is_smpl_motion(path) else (body, ())
 
@@ -485,7 +485,7 @@ def motion_of_transforms(
     )
     if not points and not shown and all(is_held):
         return Motion(name, times, codes, None, None, source)
-    moved_joints = space.own_joints(codes, transforms)
+    moved_joints = space.joint_offsets(codes, transforms)
     n_kept = max(2, _MOST_BYTES // (24 * int(np.count_nonzero(space.rig.weights))))
 
     @lru_cache(n_kept)
@@ -495,7 +495,9 @@ def motion_of_transforms(
     @lru_cache(n_kept)
     def body(frame: int) -> RigPoseSpace:
         shaped = shape(points[frame]) if frame in points else None
-        own_space = space.with_own(moved_joints.offsets[frame], moved_joints.linear[frame], shaped)
+        own_space = space.with_joint_offsets(
+            moved_joints.offsets[frame], moved_joints.linear[frame], shaped
+        )
         if frame not in shown:
             return own_space
         vertices = shown[frame]().astype(np.float64)
@@ -503,7 +505,7 @@ def motion_of_transforms(
 
     def space_at(time: float) -> RigPoseSpace:
         frame, share = int(time), time % 1.0
-        return body(frame).towards(body(frame + 1), share) if share else body(frame)
+        return body(frame).interpolated(body(frame + 1), share) if share else body(frame)
 
     @cache
     def hidden(frame: int) -> npt.NDArray[np.intp]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.files.names import numbered_where_equal
+from lcollision_core.files.names import make_unique
 from lcollision_core.meshes.topology import FloatArray
 
 MAX_NAME_LENGTH = 60
@@ -118,7 +118,7 @@ def unique_names(names: Iterable[str], max_length: int = MAX_POSE_NAME_LENGTH) -
 
     Numbered names are at most `max_length` long.
     """
-    return numbered_where_equal(
+    return make_unique(
         names, str.casefold, lambda name, ending: name[: max_length - len(ending)] + ending
     )
 

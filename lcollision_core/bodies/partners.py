@@ -24,13 +24,13 @@ from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.bodies.skeletons import (
     Anatomy,
     joint_roles,
-    next_in_limb,
+    limb_children,
     plain_name,
     rig_of,
     role_name,
     role_of_word,
 )
-from lcollision_core.bodies.standing_pose import SkeletonMotion, last_in_common
+from lcollision_core.bodies.standing_pose import SkeletonMotion, common_ancestor
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.files import Character
 from lcollision_core.files.safe import atomic_write, read_regular
@@ -48,7 +48,7 @@ _ONE_EACH = (*ALIGNED, Role.SHOULDER, Role.HAND, Role.FOOT, Role.TOE, Role.NECK,
 _NEEDED = (*ALIGNED, Role.HAND, Role.FOOT, Role.HEAD)
 _FORMAT, _MAX_BYTES = "lcollision-joints", 10_000_000
 
-Followed = Mapping[str, str | None]
+JointMap = Mapping[str, str | None]
 """From each rig joint's name to the name of the skeleton joint it follows; None for none."""
 
 
@@ -58,17 +58,17 @@ class JointMatch:
 
     Attributes
     ----------
-    theirs : names of the skeleton's joints
-    ours : J names of the rig's joints
-    called : J words for each joint's role, as "left elbow"; "" if unknown
+    source_joints : names of the skeleton's joints
+    rig_joints : J names of the rig's joints
+    labels : J words for each joint's role, as "left elbow"; "" if unknown
     followed : the skeleton joint of each rig joint
     unsure : rig joints whose match is uncertain by both names and positions
     """
 
-    theirs: tuple[str, ...]
-    ours: tuple[str, ...]
-    called: tuple[str, ...]
-    followed: Followed
+    source_joints: tuple[str, ...]
+    rig_joints: tuple[str, ...]
+    labels: tuple[str, ...]
+    followed: JointMap
     unsure: frozenset[str]
 
 
@@ -78,10 +78,10 @@ class _Chosen:
 
 
 def partners(
-    motion: SkeletonMotion, anatomy: Anatomy, space: RigPoseSpace, chosen: Followed
+    motion: SkeletonMotion, anatomy: Anatomy, space: RigPoseSpace, chosen: JointMap
 ) -> npt.NDArray[np.int64]:
     """Return, for each joint of the rig, the skeleton joint that it follows, -1 for none."""
-    partner = named_alike(motion, space)
+    partner = match_by_name(motion, space)
     for joint, other in enumerate(partner.tolist()):
         kinds = {space.roles[joint], anatomy.roles[other]} & set(_ONE_EACH)
         if other >= 0 and len(kinds) > 1:
@@ -91,7 +91,7 @@ def partners(
         partner[:] = -1
     taken_joints = set(partner.tolist())
     own_sides = _sides(anatomy.roles, anatomy.sides, motion.parents)
-    in_limb = set(next_in_limb(space.rig, space.roles).values())
+    in_limb = set(limb_children(space.rig, space.roles).values())
     for role in (*_ONE_EACH, Role.SPINE):
         for side in Side:
             theirs = _of_kind(anatomy.roles, own_sides, role, side)
@@ -113,7 +113,7 @@ def partners(
         partner[joint] = fingers.get(segment, -1)
     hips = int(space.joint_of_code[0])
     if hips >= 0 and partner[hips] < 0:
-        partner[hips] = last_in_common(motion, followed_limbs(partner, space))
+        partner[hips] = common_ancestor(motion, followed_limbs(partner, space))
     for name, follows in chosen.items():
         joint = rig.joint_names.index(name)
         partner[joint] = -1 if follows is None else motion.names.index(follows)
@@ -131,7 +131,7 @@ def unsure_joints(
     figure, anatomy : of the skeleton
     """
     rig, names = space.rig, rig_of(figure).joint_names
-    by_name, in_limb = joint_roles(rig_of(figure)), next_in_limb(rig, space.roles)
+    by_name, in_limb = joint_roles(rig_of(figure)), limb_children(rig, space.roles)
     spare = {
         role
         for joint, role in enumerate(anatomy.roles)
@@ -166,22 +166,22 @@ def match_of(
 ) -> JointMatch:
     """Return the matching by names."""
     space = rig_body.space
-    called = (role_name(*kind) for kind in zip(space.roles, space.sides, strict=True))
-    words = [" ".join(reversed(name.split("-"))) for name in called]
+    role_names = (role_name(*kind) for kind in zip(space.roles, space.sides, strict=True))
+    words = [" ".join(reversed(name.split("-"))) for name in role_names]
     if space.joint_of_code[0] >= 0:
         words[int(space.joint_of_code[0])] = "hips"
     followed = [None if other < 0 else names[other] for other in partner.tolist()]
-    ours = space.rig.joint_names
+    rig_joints = space.rig.joint_names
     return JointMatch(
         tuple(names),
-        tuple(ours),
+        tuple(rig_joints),
         tuple("" if word in ("unknown", "twist") else word for word in words),
-        dict(zip(ours, followed, strict=True)),
+        dict(zip(rig_joints, followed, strict=True)),
         unsure,
     )
 
 
-def as_chosen(figure: Character, chosen: Followed, space: RigPoseSpace) -> Character:
+def with_chosen_roles(figure: Character, chosen: JointMap, space: RigPoseSpace) -> Character:
     """Return a skeleton whose joints take the roles of the rig joints that follow them."""
     rig, names = rig_of(figure), space.rig.joint_names
     roles = {
@@ -192,7 +192,7 @@ def as_chosen(figure: Character, chosen: Followed, space: RigPoseSpace) -> Chara
     return replace(figure, rig=replace(rig, chosen=roles)) if roles else figure
 
 
-def chosen_for(motion: SkeletonMotion, space: RigPoseSpace, path: Path) -> Followed:
+def user_joint_map(motion: SkeletonMotion, space: RigPoseSpace, path: Path) -> JointMap:
     """Return the user's choices for a skeleton: those for this task, else the remembered ones.
 
     Raises
@@ -239,7 +239,7 @@ def read_followed(path: str | os.PathLike[str]) -> _Chosen:
         raise ModelFileError.unreadable(path, error, advice) from error
 
 
-def following(body: Body, file: str | os.PathLike[str]) -> RigBody:
+def with_joint_map(body: Body, file: str | os.PathLike[str]) -> RigBody:
     """Return a character whose joints follow other skeletons as given in a file.
 
     Raises
@@ -258,14 +258,14 @@ def following(body: Body, file: str | os.PathLike[str]) -> RigBody:
     return RigBody.of(replace(body.character, rig=rig)).with_choices_of(body)
 
 
-def remember_followed(match: JointMatch, followed: Followed) -> None:
+def remember_followed(match: JointMatch, followed: JointMap) -> None:
     """Remember the matching for all motions of that skeleton on that rig.
 
     Raises
     ------
     ModelFileError : the file cannot be written.
     """
-    path = _path(match.theirs, match.ours)
+    path = _path(match.source_joints, match.rig_joints)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         document = {"format": _FORMAT, "format_version": 1, "joints": dict(followed)}
@@ -276,14 +276,16 @@ def remember_followed(match: JointMatch, followed: Followed) -> None:
         raise ModelFileError.because(what, "cannot be kept", error, "try again") from error
 
 
-def _path(theirs: Sequence[str], ours: Sequence[str]) -> Path:
+def _path(source_joints: Sequence[str], rig_joints: Sequence[str]) -> Path:
     from platformdirs import user_data_path
 
-    digest = hashlib.sha256(json.dumps([list(theirs), list(ours)]).encode()).hexdigest()[:16]
+    digest = hashlib.sha256(
+        json.dumps([list(source_joints), list(rig_joints)]).encode()
+    ).hexdigest()[:16]
     return user_data_path("lcollision", appauthor=False) / "joints" / f"{digest}.json"
 
 
-def named_alike(motion: SkeletonMotion, space: RigPoseSpace) -> npt.NDArray[np.int64]:
+def match_by_name(motion: SkeletonMotion, space: RigPoseSpace) -> npt.NDArray[np.int64]:
     """Return, for each joint of the rig, the first skeleton joint of that name, -1 for none."""
     joint_by_name = {
         common_name(name): joint for joint, name in reversed(list(enumerate(motion.names)))

@@ -22,10 +22,10 @@ from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 from msgspec.structs import astuple
 
 from lcollision_core.bodies.body import Body
-from lcollision_core.bodies.known import find_character
 from lcollision_core.bodies.learned_body import ListedModel, find_latent_space, user_models_folder
 from lcollision_core.bodies.mirror import MirroredPose, MirrorSource, Symmetry, pose_bytes
 from lcollision_core.bodies.names import MAX_POSE_NAME_LENGTH, unique_names
+from lcollision_core.bodies.remembered import find_character
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.files import (
     FileStamp,
@@ -38,7 +38,7 @@ from lcollision_core.files import (
 )
 from lcollision_core.files.safe import read_regular
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.json_values import parse_json, quoted, typed
+from lcollision_core.json_values import convert_checked, parse_json, quoted
 from lcollision_core.meshes import RigidTransform
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class NamedPose:
             fit_error_mean=None if image.restored else image.fit_error_mean,
             fit_error_max=None if image.restored else image.fit_error_max,
             mirror_of=image.source,
-            pins=tuple(map(symmetry.image_of_pin, self.pins)),
+            pins=tuple(map(symmetry.mirror_pin, self.pins)),
             moves=None,
         )
 
@@ -229,7 +229,7 @@ def write_poses(
             file.write(content)
             file.write(b"\n")
     except MeshFileError as error:
-        raise ModelFileError.like(error) from error
+        raise ModelFileError.from_error(error) from error
 
 
 def read_poses(path: str | os.PathLike[str], model: Body) -> tuple[NamedPose, ...]:
@@ -268,7 +268,7 @@ def read_pose_file(path: str | os.PathLike[str], model: Body) -> PoseFile:
     return _parse(document, path, model)
 
 
-def why_no_name(name: str) -> str:
+def name_error(name: str) -> str:
     """Return why a name is invalid for a pose, or "" if it is valid."""
     if not 0 < len(name) <= MAX_POSE_NAME_LENGTH:
         return f"its name must have 1 to {MAX_POSE_NAME_LENGTH} characters"
@@ -453,9 +453,9 @@ def _stored_placement(placement: RigidTransform | None) -> _StoredPlacement | Un
 
 
 def _from_json(entry: Any, model: Body) -> NamedPose:
-    pose = typed(_StoredPose, entry, "pose")
+    pose = convert_checked(_StoredPose, entry, "pose")
     for name in (pose.name, *pose.tags):
-        if reason := why_no_name(name):
+        if reason := name_error(name):
             raise ValueError(reason if name is pose.name else f"of its tag {name!r}, {reason}")
     latent, placement = _latent(pose, model), _placement(pose.placement)
     mean = largest = source = None

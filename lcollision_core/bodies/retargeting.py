@@ -18,20 +18,20 @@ from lcollision_core.bodies.partners import (
     ALIGNED,
     LEAST_JOINTS,
     JointMatch,
-    as_chosen,
-    chosen_for,
     followed_limbs,
+    match_by_name,
     match_of,
-    named_alike,
     partners,
     unsure_joints,
+    user_joint_map,
+    with_chosen_roles,
 )
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
-from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, next_in_limb, rig_of
+from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, limb_children, rig_of
 from lcollision_core.bodies.smpl_skeleton import skeleton_of_smpl
 from lcollision_core.bodies.standing_pose import (
-    RestedMotion,
+    ReposedMotion,
     SkeletonMotion,
     in_world,
     least_turn,
@@ -87,7 +87,7 @@ class Retargeting:
     is_same_rig : whether both are the same rig, so that positions match too
     """
 
-    motion: RestedMotion
+    motion: ReposedMotion
     space: RigPoseSpace
     partner: npt.NDArray[np.int64]
     frame: FloatArray
@@ -125,7 +125,7 @@ class Retargeting:
         frame = nearest_axes(axes[None])
         joints = rig.rest[:, :3, 3]
         scale = _leg_length(rig, space.roles) / _leg_length(rig_of(figure), anatomy.roles)
-        next_bone = next_in_limb(rig, space.roles)
+        next_bone = limb_children(rig, space.roles)
         aligned = np.broadcast_to(np.eye(3), (len(joints), 3, 3)).copy()
         for joint, (role, parent) in enumerate(zip(space.roles, rig.parents, strict=True)):
             if parent >= 0 and role not in (Role.FOOT, Role.SHOULDER, Role.SPINE):
@@ -194,7 +194,7 @@ class Retargeting:
         """
         frame_numbers = list(frames)
         turns, _ = in_world(self.motion)
-        old_turns, local = turns[frame_numbers], self.motion.turns()[frame_numbers]
+        old_turns, local = turns[frame_numbers], self.motion.rotations()[frame_numbers]
         rest = np.linalg.inv(self.space.rig.rest)
         difference = (after @ rest)[..., :3, :3] @ np.linalg.inv((before @ rest)[..., :3, :3])
         # If several joints follow one, the last carries its children.
@@ -208,7 +208,7 @@ class Retargeting:
                 local[:, joint] = np.swapaxes(above, -2, -1) @ new_turns[:, joint]
             else:
                 new_turns[:, joint] = above @ local[:, joint]
-        roots: FloatArray = self.motion.places()[frame_numbers, 0]
+        roots: FloatArray = self.motion.positions()[frame_numbers, 0]
         if self._hips >= 0:
             roots += (after - before)[:, self._hips, :3, 3] @ self.frame / self.scale
         return self.motion.turns_as_stored(local), roots
@@ -231,7 +231,7 @@ class Retargeting:
 
 
 def _followed(
-    motion: RestedMotion, rest: FloatArray, space: RigPoseSpace, path: Path
+    motion: ReposedMotion, rest: FloatArray, space: RigPoseSpace, path: Path
 ) -> tuple[Character, Anatomy, npt.NDArray[np.int64], frozenset[str]]:
     """Return a skeleton's figure, its anatomy, each rig joint's partner, and unsure joints.
 
@@ -239,8 +239,8 @@ def _followed(
     ----------
     rest : (J, 3) positions of its joints
     """
-    chosen_partners = chosen_for(motion, space, path)
-    figure = as_chosen(stick_figure(motion, rest, motion.up), chosen_partners, space)
+    chosen_partners = user_joint_map(motion, space, path)
+    figure = with_chosen_roles(stick_figure(motion, rest, motion.up), chosen_partners, space)
     anatomy = _facing(anatomy_of(figure), motion.front)
     partner = partners(motion, anatomy, space, chosen_partners)
     unsure = frozenset() if chosen_partners else unsure_joints(partner, figure, anatomy, space)
@@ -281,17 +281,17 @@ _SAME_BONE, _ALIKE, _TWISTED = np.cos(np.radians([5.0, 30.0, 60.0]))
 twist of a hinge, which no pose makes."""
 
 
-def _as_the_rig(motion: NodeMotion, space: RigPoseSpace) -> RestedMotion | None:
+def _as_the_rig(motion: NodeMotion, space: RigPoseSpace) -> ReposedMotion | None:
     """Return a motion of a rig's own joints with the rig's rest pose; None for other joints.
 
     Joints are the rig's own if they have its names and their bones have the same local directions,
     whatever pose the file stores, and whatever their lengths.
     """
-    rig, partner = space.rig, named_alike(motion, space)
+    rig, partner = space.rig, match_by_name(motion, space)
     if len(followed_limbs(partner, space)) < LEAST_JOINTS:
         return None
     axes, places, cosines = rotations_of(rig.rest), rig.rest[:, :3, 3], list[float]()
-    in_limb, size = next_in_limb(rig, space.roles), float(np.ptp(rig.rest[:, :3, 3], axis=0).max())
+    in_limb, size = limb_children(rig, space.roles), float(np.ptp(rig.rest[:, :3, 3], axis=0).max())
     for joint, parent in enumerate(rig.parents.tolist()):
         other, above = int(partner[joint]), int(partner[parent])
         if parent < 0 or min(other, above) < 0 or motion.parents[other] != above:
@@ -318,7 +318,7 @@ def _as_the_rig(motion: NodeMotion, space: RigPoseSpace) -> RestedMotion | None:
         elif parent >= 0:
             rested[joint] = rested[parent] @ motion.axes[parent].T @ motion.axes[joint]
     turns: FloatArray = rested @ np.swapaxes(motion.axes, 1, 2)
-    return RestedMotion(motion, turns, space.up @ frame, space.front @ frame)
+    return ReposedMotion(motion, turns, space.up @ frame, space.front @ frame)
 
 
 def _axes_of_rig(
@@ -357,7 +357,7 @@ def _twist(turn: FloatArray, axis: FloatArray) -> float:
 
 def _leg_length(rig: Rig, roles: Sequence[Role]) -> float:
     """Return the mean length of thigh plus shin; without legs, the rig's extent."""
-    places, below = rig.rest[:, :3, 3], next_in_limb(rig, roles)
+    places, below = rig.rest[:, :3, 3], limb_children(rig, roles)
     bones = [
         float(np.linalg.norm(places[below[joint]] - places[joint]))
         for joint, role in enumerate(roles)
@@ -464,7 +464,7 @@ def bvh_of(space: RigPoseSpace, transforms: FloatArray, frame_time: float) -> by
     return bvh_bytes(names, parents, moved.rest, ends, *from_parents, frame_time)
 
 
-def held_by_bvh(space: RigPoseSpace, bvh: Bvh) -> FloatArray:
+def transforms_from_bvh(space: RigPoseSpace, bvh: Bvh) -> FloatArray:
     """Return the (T, J, 4, 4) transforms of a rig's joints from a file of `bvh_of`."""
     rig, parents = space.rig, _one_tree(space.rig)
     axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
@@ -575,7 +575,7 @@ def _bones(character: Character, space: RigPoseSpace) -> tuple[bool, dict[str, i
 def _recognised(space: RigPoseSpace) -> dict[str, int]:
     """Return the joint of each VRM bone, by the joints' roles."""
     rig, roles, sides = space.rig, space.roles, space.sides
-    kinds, in_limb = list(zip(roles, sides, strict=True)), set(next_in_limb(rig, roles).values())
+    kinds, in_limb = list(zip(roles, sides, strict=True)), set(limb_children(rig, roles).values())
     joints: dict[str, int] = {}
     for side in (Side.LEFT, Side.RIGHT):
         for role, name in _LIMBS.items():
@@ -645,7 +645,7 @@ def _t_pose(
     parents : of the bones
     is_there : whether the rest pose is a T pose already
     """
-    joints, next_bone = list(bones.values()), next_in_limb(space.rig, space.roles)
+    joints, next_bone = list(bones.values()), limb_children(space.rig, space.roles)
     turned = np.broadcast_to(np.eye(3), (len(joints), 3, 3)).copy()
     places = rest[joints].copy()
     down, across = np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
@@ -670,7 +670,7 @@ _SAME = 1e-4
 """Normalised tolerance within which a skeleton represents a frame."""
 
 
-def carried_motions(
+def retargeted_motions(
     body: Body, path: Path, clip: str | None = None, fps: float | None = None
 ) -> list[tuple[Motion, Retargeting]]:
     """Read a skeleton's motions, retargeted to a character; return them with their mappings.
@@ -818,9 +818,9 @@ def write_skeleton(
         out.write(data)
     if is_bvh:
         # Any rig can read back its own BVH file; retargeting might not match it.
-        latents_in_file = held_by_bvh(body.space, read_bvh(path))
+        latents_in_file = transforms_from_bvh(body.space, read_bvh(path))
     else:
-        ((back, _),) = carried_motions(body, Path(path), fps=fps)
+        ((back, _),) = retargeted_motions(body, Path(path), fps=fps)
         codes = back.codes
         latents_in_file = np.array([body.space.transforms(row) for row in codes])
     space, size = body.space, body.body_size

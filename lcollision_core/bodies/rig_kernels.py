@@ -2,8 +2,8 @@
 
 Joint b turns by exp(w_b) in its own axes X_b about its rest position o_b, and moves with its
 parent: D_b = D_parent o (x -> p_b + X_b exp(w_b) Y_b (x - o_b)). D_0 adds the shift. For a body at
-rest p_b is o_b and Y_b is X_b^-1; for one that a clip scales and stretches see `OwnJoints`. X_b is
-orthonormal unless an ancestor is scaled unevenly at rest. Then it is P_b times an orthonormal
+rest p_b is o_b and Y_b is X_b^-1; for one that a clip scales and stretches see `JointOffsets`. X_b
+is orthonormal unless an ancestor is scaled unevenly at rest. Then it is P_b times an orthonormal
 frame, so that the joint's local transform is still a pure rotation, and P_b shears as in every
 engine; see `Rig.stretch`. A vertex is the weighted mean of D_b points over its influences. Parents
 come before children; b counts the joints that have codes.

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
-from lcollision_core.bodies.skeletons import next_in_limb
+from lcollision_core.bodies.skeletons import limb_children
 from lcollision_core.bundled import bundled_table
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes.joint_kinds import Role, Side
@@ -138,7 +138,7 @@ class _Body:
         self._places = space.origins @ self._axes.T
         self._bones = np.einsum("ij,njk->nik", self._axes, space.axes)
         """(J, 3, 3) joint axes at rest."""
-        self._next = next_in_limb(rig, space.roles)
+        self._next = limb_children(rig, space.roles)
         self._limbs = {
             (role, side): joint
             for joint in sorted(self._next, reverse=True)

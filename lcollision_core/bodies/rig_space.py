@@ -71,7 +71,7 @@ _SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
-class OwnJoints:
+class JointOffsets:
     """Scales and offsets of joints in N poses, beside the turns in their codes.
 
     Attributes
@@ -212,7 +212,7 @@ class RigPoseSpace:
             stretch[0] = rig.stretch[self._bones[0 if root >= 0 else 1]]
             self._bone_axes = stretch @ self._bone_axes
         self._bone_inverses = np.linalg.inv(self._bone_axes)
-        # Values for the body at rest: see `with_own`.
+        # Values for the body at rest: see `with_joint_offsets`.
         self._places, self._own, self._own_inverses = (
             self._bone_origins,
             self._bone_inverses,
@@ -768,7 +768,7 @@ class RigPoseSpace:
             codes[:, self.are_shapes] = shapes
         return codes if given.ndim == 4 else codes[0]
 
-    def codes_of_turns(self, turns: FloatArray, shifts: FloatArray) -> FloatArray:
+    def codes_of_rotations(self, turns: FloatArray, shifts: FloatArray) -> FloatArray:
         """Return the (N, D) codes of joint turns; turns of joints without codes are lost.
 
         Parameters
@@ -783,8 +783,8 @@ class RigPoseSpace:
         numbers[:, 3:] = angles.reshape(len(turns), -1)
         return self._by_codes(numbers)
 
-    def turns_of(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the turns and the shift of a pose, (J, 3) and (3,): see `codes_of_turns`."""
+    def rotations_of(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the turns and the shift of a pose, (J, 3) and (3,): see `codes_of_rotations`."""
         turns, shift = self._turns(codes)
         of_joints = np.zeros((self.n_joints, 3))
         of_joints[self._bones] = np.einsum("bxi,bi->bx", self._bone_axes, turns)
@@ -854,7 +854,7 @@ class RigPoseSpace:
         other._origin = self._origin or self
         return other
 
-    def own_joints(self, codes: FloatArray, transforms: npt.ArrayLike) -> OwnJoints:
+    def joint_offsets(self, codes: FloatArray, transforms: npt.ArrayLike) -> JointOffsets:
         """Return the scales and offsets of joints in (N, D) poses that codes do not express.
 
         Parameters
@@ -881,19 +881,19 @@ class RigPoseSpace:
         offsets[:, 0] -= numbers[:, :3] @ self._body.T
         turned = Rotation.from_rotvec(numbers[:, 3:].reshape(-1, 3)).as_matrix()
         turned = turned.reshape(linear.shape)
-        return OwnJoints(
+        return JointOffsets(
             (back @ offsets[..., None])[..., 0] - origins,
             np.swapaxes(turned, 2, 3) @ self._bone_inverses @ back @ linear,
         )
 
-    def with_own(
+    def with_joint_offsets(
         self, offsets: FloatArray, linear: FloatArray, points: FloatArray | None = None
     ) -> RigPoseSpace:
         """Return the same poses of a body with another scale, stretch or shape at rest.
 
         Parameters
         ----------
-        offsets, linear : of one pose, see `OwnJoints`
+        offsets, linear : of one pose, see `JointOffsets`
         points : (M, 3) as from `influence_points`; by default the body's own
         """
         other = self._copy()
@@ -904,13 +904,13 @@ class RigPoseSpace:
             other._points = points
         return other
 
-    def towards(self, other: RigPoseSpace, share: float) -> RigPoseSpace:
+    def interpolated(self, other: RigPoseSpace, share: float) -> RigPoseSpace:
         """Return the poses of a body interpolated towards another one by a share."""
 
         def between(one: FloatArray, another: FloatArray) -> FloatArray:
             return one if one is another else (1.0 - share) * one + share * another
 
-        return self.with_own(
+        return self.with_joint_offsets(
             between(self._places, other._places) - self._bone_origins,
             between(self._own, other._own),
             between(self._points, other._points),

@@ -638,7 +638,7 @@ class SceneBody(Body):
         away = np.linalg.norm(vertices - self._space.decode(latent[None])[0], axis=1)
         return LatentFit(latent, np.eye(3), np.zeros(3), float(away.mean()), float(away.max()))
 
-    def apart(self, latent: FloatArray) -> list[FloatArray]:
+    def separated_poses(self, latent: FloatArray) -> list[FloatArray]:
         """Return variants of a (D,) pose with the bodies moved apart and out of the ground.
 
         They move along the line on which they stand, sideways, forward or up.
@@ -686,14 +686,18 @@ class SceneBody(Body):
     @cached_property
     def free_latent(self) -> FloatArray:
         """(F, D) collision-free rest poses with the bodies apart, read-only."""
-        poses = np.array([np.zeros(self.latent_size), *self.apart(np.zeros(self.latent_size))])
+        poses = np.array(
+            [np.zeros(self.latent_size), *self.separated_poses(np.zeros(self.latent_size))]
+        )
         return read_only(poses[self.exact_check().are_free(poses)])
 
     @cached_property
     def resolver(self) -> PoseResolver:
         """Resolves collisions within and between bodies."""
         bodies = self._alone.values() if self._own_rules_hold else ()
-        return SceneResolver(self.exact_check(), self.free_latent, self.starts, tuple(bodies))
+        return SceneResolver(
+            self.exact_check(), self.free_latent, self.starting_poses, tuple(bodies)
+        )
 
     @property
     def _own_rules_hold(self) -> bool:
@@ -725,7 +729,7 @@ class SceneBody(Body):
             )
         return alone
 
-    def starts(self, target: FloatArray, check: ExactCheck) -> FloatArray:
+    def starting_poses(self, target: FloatArray, check: ExactCheck) -> FloatArray:
         """Return poses near a (D,) target with resolved bodies apart; they may still collide.
 
         Parameters
@@ -741,7 +745,7 @@ class SceneBody(Body):
         for body in self._alone.values():
             found = body.resolver.resolve(target[body.codes], body.options(options))
             latent[body.codes] = found.latent
-        return np.array(self.apart(latent)).reshape(-1, self.latent_size)
+        return np.array(self.separated_poses(latent)).reshape(-1, self.latent_size)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.body import Body
-from lcollision_core.bodies.known import open_body, open_character
 from lcollision_core.bodies.mesh_body import MeshBody
 from lcollision_core.bodies.names import unique_names
+from lcollision_core.bodies.remembered import open_body, open_character
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember, ScenePart
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError

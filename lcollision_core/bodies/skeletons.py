@@ -551,7 +551,7 @@ def joint_sides(rig: Rig, left: FloatArray) -> list[Side]:
     return sides
 
 
-def next_in_limb(rig: Rig, roles: Sequence[Role]) -> dict[int, int]:
+def limb_children(rig: Rig, roles: Sequence[Role]) -> dict[int, int]:
     """Return the joint at the far end of each thigh, shin, upper arm and forearm."""
     next_joint: dict[int, int] = {}
     for joint, role in enumerate(roles):
@@ -577,7 +577,7 @@ def bone_directions(rig: Rig, origins: FloatArray, roles: Sequence[Role]) -> Flo
     size = float(np.ptp(origins, axis=0).max()) + float(np.ptp(rig.points, axis=(0, 1)).max())
     directions = np.zeros_like(origins)
     heaviest = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)]
-    next_of = next_in_limb(rig, roles)
+    next_of = limb_children(rig, roles)
     for joint, parent in enumerate(rig.parents):
         following = rig.parents == joint
         if joint in next_of:
@@ -644,7 +644,7 @@ def joint_axes(
     second lies along the bone, the third turns it sideways.
     """
     middle = origins.mean(axis=0)
-    above = {hinge: joint for joint, hinge in next_in_limb(rig, roles).items()}
+    above = {hinge: joint for joint, hinge in limb_children(rig, roles).items()}
     axes = np.empty((len(origins), 3, 3))
     for joint, (role, bone) in enumerate(zip(roles, directions, strict=True)):
         towards = front
@@ -685,7 +685,7 @@ def joint_limits(rig: Rig, roles: tuple[Role, ...]) -> tuple[FloatArray, FloatAr
 
 
 ROLE_NAMES: Mapping[str, tuple[Role, Side]] = {
-    f"{kind.called}-{side.value}" if kind.is_paired else kind.called: (role, side)
+    f"{kind.label}-{side.value}" if kind.is_paired else kind.label: (role, side)
     for role, kind in JOINT_KINDS.items()
     for side in ((Side.LEFT, Side.RIGHT) if kind.is_paired else (Side.MIDDLE,))
 }

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies.skeletons import anatomy_of, joint_roles, next_in_limb, rig_of
+from lcollision_core.bodies.skeletons import anatomy_of, joint_roles, limb_children, rig_of
 from lcollision_core.files.character import Character, ClipFrames, Rig
 from lcollision_core.files.motion.node_motion import least_turns
 from lcollision_core.meshes.joint_kinds import Role, Side
@@ -64,15 +64,15 @@ class SkeletonMotion(Protocol):
     def __len__(self) -> int:
         """T, the number of frames."""
 
-    def turns(self) -> FloatArray:
+    def rotations(self) -> FloatArray:
         """(T, J, 3, 3) rotations of the joints relative to their parents; the caller may modify."""
 
-    def places(self) -> FloatArray:
+    def positions(self) -> FloatArray:
         """(T, J, 3) positions of the joints relative to their parents; the caller may modify."""
 
 
 @dataclass(frozen=True, eq=False)
-class RestedMotion:
+class ReposedMotion:
     """The same motion with another rest pose.
 
     Attributes
@@ -116,14 +116,14 @@ class RestedMotion:
         """Return the number of frames."""
         return len(self.stored)
 
-    def turns(self) -> FloatArray:
+    def rotations(self) -> FloatArray:
         """Return (T, J, 3, 3) rotations of the joints relative to their parents."""
-        turns: FloatArray = self._above() @ self.stored.turns()
+        turns: FloatArray = self._above() @ self.stored.rotations()
         return turns @ np.swapaxes(self.rest_turns, 1, 2)
 
-    def places(self) -> FloatArray:
+    def positions(self) -> FloatArray:
         """Return (T, J, 3) positions of the joints relative to their parents."""
-        places: FloatArray = np.einsum("jxy,tjy->tjx", self._above(), self.stored.places())
+        places: FloatArray = np.einsum("jxy,tjy->tjx", self._above(), self.stored.positions())
         return places
 
     def turns_as_stored(self, turns: FloatArray) -> FloatArray:
@@ -161,7 +161,7 @@ class _Landmarks:
     @classmethod
     def of(cls, roles: Sequence[Role], sides: Sequence[Side], rig: Rig) -> _Landmarks | None:
         """Find them; None if the skeleton lacks some."""
-        below = next_in_limb(rig, roles)
+        below = limb_children(rig, roles)
         limbs = []
         for role in (Role.THIGH, Role.UPPER_ARM):
             firsts = {
@@ -202,14 +202,14 @@ class _Landmarks:
         )
 
 
-def with_standing_rest(motion: SkeletonMotion) -> RestedMotion:
+def with_standing_rest(motion: SkeletonMotion) -> ReposedMotion:
     """Return a motion with a standing rest pose: its own, or one taken from its frames.
 
     It keeps its own if that stands, along y or the frames' up axis, or if no frame stands.
     """
     rest = rest_places(motion)
     own_turns = np.broadcast_to(np.eye(3), (len(motion.names), 3, 3))
-    as_stored = RestedMotion(motion, own_turns, longer_axis(rest))
+    as_stored = ReposedMotion(motion, own_turns, longer_axis(rest))
     samples = np.linspace(0, len(motion) - 1, min(len(motion), _MOST_SAMPLES)).round().astype(int)
     turns, places = in_world(motion, samples)
     marks = _named_landmarks(motion, rest)
@@ -234,7 +234,7 @@ def with_standing_rest(motion: SkeletonMotion) -> RestedMotion:
     own_way = marks.trunk(rest)
     is_level = mean @ up < _UPRIGHT
     if stands and own_way[1] > _UPRIGHT and _stands_on_z(marks, rest, places):
-        return RestedMotion(motion, np.broadcast_to(_TO_Z_UP, own_turns.shape), up)
+        return ReposedMotion(motion, np.broadcast_to(_TO_Z_UP, own_turns.shape), up)
     if stands and (own_way[1] > _UPRIGHT or own_way @ up > _UPRIGHT or is_level):
         return as_stored
     best = int(np.argmax([_likeness(marks, shown, up) for shown in places]))
@@ -245,7 +245,7 @@ def with_standing_rest(motion: SkeletonMotion) -> RestedMotion:
     front = np.sign(level[np.abs(level).argmax()]) * np.eye(3)[np.abs(level).argmax()]
     upright = np.stack([np.cross(up, front), up, front], axis=1)
     rested = _plain_pose(motion, marks, turns, places[best], best, upright)
-    return RestedMotion(motion, rested, up, front, int(samples[best]))
+    return ReposedMotion(motion, rested, up, front, int(samples[best]))
 
 
 def _stands_on_z(marks: _Landmarks, rest: FloatArray, places: FloatArray) -> bool:
@@ -328,12 +328,12 @@ def _plain_pose(
 
 def _chest(motion: SkeletonMotion, marks: _Landmarks) -> int:
     """Return the last joint above both arms, -1 if it is also a parent of the thighs."""
-    chest = last_in_common(motion, marks.arms)
+    chest = common_ancestor(motion, marks.arms)
     above_thighs = {int(motion.parents[thigh]) for thigh in marks.thighs}
     return -1 if chest in above_thighs else chest
 
 
-def last_in_common(motion: SkeletonMotion, joints: Sequence[int]) -> int:
+def common_ancestor(motion: SkeletonMotion, joints: Sequence[int]) -> int:
     """Return the last joint that is an ancestor of, or equal to, all given joints."""
     ways = []
     for joint in joints:
@@ -348,7 +348,7 @@ def in_world(
     motion: SkeletonMotion, frames: npt.NDArray[np.int64] | slice = slice(None)
 ) -> tuple[FloatArray, FloatArray]:
     """Return world rotations (T, J, 3, 3) and positions (T, J, 3) of the joints in some frames."""
-    turns, places = motion.turns()[frames], motion.places()[frames]
+    turns, places = motion.rotations()[frames], motion.positions()[frames]
     for joint, parent in enumerate(motion.parents.tolist()):
         if parent >= 0:
             moved = np.einsum("txy,ty->tx", turns[:, parent], places[:, joint])

@@ -49,7 +49,7 @@ from lcollision_core.contact.search import (
     UncountedTables,
     build_tree,
 )
-from lcollision_core.devices import takes_gpu
+from lcollision_core.devices import uses_gpu
 from lcollision_core.errors import ShapeError
 from lcollision_core.files.mesh_file import can_hold
 from lcollision_core.jobs import UNWATCHED, Job, available_cores, for_blocks
@@ -708,7 +708,7 @@ class CollisionDetector:
                     **{name: energy[start:stop] for name, energy in energies.items()},
                 )
 
-        if self._nearness is None and takes_gpu(len(poses), self.topology.n_faces):
+        if self._nearness is None and uses_gpu(len(poses), self.topology.n_faces):
             for number in self.gpu_search().count(
                 poses,
                 n_by_rule,

@@ -131,7 +131,7 @@ def fit_latent(
     CancelledError : the job was cancelled.
     """
     inverse_variance = np.asarray(deviation, dtype=np.float64) ** -2.0
-    picked = codec.topology.picked
+    picked = codec.topology.used_index
     target = np.asarray(vertices, dtype=np.float64)[picked]
     n_vertices, n_codes = len(target), len(inverse_variance)
 
@@ -643,7 +643,7 @@ class Embedding:
         aligned = vertices
         if not in_place:
             weights = np.zeros(self.topology.n_vertices)
-            weights[self.topology.picked] = self.alignment_weights[self.topology.picked]
+            weights[self.topology.used_index] = self.alignment_weights[self.topology.used_index]
             rotation, translation = fit_rigid(vertices, self.rest_vertices, weights)
             aligned = vertices @ rotation.T + translation
         guess = self.guess(self.codec.encode(aligned[None]))[0]

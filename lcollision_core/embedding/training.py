@@ -110,14 +110,14 @@ class _Trainer:
         vertices = np.asarray(pose_set.vertices, dtype=np.float64)
         if not can_hold(vertices[0], topology, np.float32):
             # So far from the origin, float32 would lose the shape.
-            vertices = vertices - vertices[0, topology.picked].mean(axis=0)
+            vertices = vertices - vertices[0, topology.used_index].mean(axis=0)
         vertices = vertices / body_size(vertices[0], topology)
         key = run_key(
             {"vertices": pose_set.vertices, "faces": pose_set.faces},
             {**asdict(config), "seed": seed, "version": _RUN_VERSION},
         )
         checkpoint_file = Checkpoint(checkpoint, key)
-        self._picked = topology.picked
+        self._picked = topology.used_index
         alignment = align_rigid(vertices[:, self._picked], vertices[0, self._picked], job)
         weights = np.zeros(topology.n_vertices)
         weights[self._picked] = alignment.weights

@@ -25,7 +25,7 @@ from lcollision_core.files.character import (
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.gltf.write import gltf_of
 from lcollision_core.files.mesh_file import turn_to_y
-from lcollision_core.files.names import numbered_where_equal
+from lcollision_core.files.names import make_unique
 from lcollision_core.files.scene.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.files.scene.scene import Scene, ScenePoses, parents_first
 from lcollision_core.files.scene.smpl import SmplModel, read_smpl
@@ -273,18 +273,18 @@ def read_character(
     else:
         document = source if isinstance(source, SceneDocument) else open_scene(source)
         character = character_of(read_scene(document), document.path, topology)
-    return character if up is None else turned(character, _axis(up))
+    return character if up is None else with_up_axis(character, _axis(up))
 
 
-def turned(character: Character, axis: int) -> Character:
+def with_up_axis(character: Character, axis: int) -> Character:
     """Return a character with the up axis 0, 1 or 2, whatever its file says."""
     return replace(character, up=np.eye(3)[axis], up_is_sure=True)
 
 
-def as_read(character: Character) -> Character:
+def without_user_choices(character: Character) -> Character:
     """Return a character as in its file, without the user's choices of up axis and roles."""
     if character.smpl is not None and character.rig is not None:
-        return turned(replace(character, rig=replace(character.rig, chosen={})), 1)
+        return with_up_axis(replace(character, rig=replace(character.rig, chosen={})), 1)
     if character.file is None or character.rig is None:
         return character
     up, is_sure = _up(character.file.scene, character.file.mesh, character.rest_vertices)
@@ -525,7 +525,7 @@ def _rig(
             "its file blends the skin by dual quaternions, but its poses are blended linearly",
         )
     rig = Rig(
-        tuple(numbered_where_equal(scene.node_names[node] or f"node {node}" for node in order)),
+        tuple(make_unique(scene.node_names[node] or f"node {node}" for node in order)),
         np.array([_parent_joint(scene, node, joint) for node in order], dtype=np.int64),
         rest[order],
         np.array(order, dtype=np.int64),

@@ -55,14 +55,14 @@ def rounding_step(
     step : in the mesh's unit
     ratio : the step divided by the 10th percentile of the edge lengths above 0; 0 if there are none
     """
-    used = np.asarray(vertices, dtype=np.float64)[topology.picked]
+    used = np.asarray(vertices, dtype=np.float64)[topology.used_index]
     farthest = float(np.abs(used).max())
     # The spacing of the largest number is infinite.
     nearer = min(farthest, float(np.finfo(dtype).max) / 2.0)
     step = float(np.spacing(np.asarray(nearer, dtype=dtype)))
     # Scale to at most 1, so that squares do not overflow.
     points = np.zeros((topology.n_vertices, 3))
-    points[topology.picked] = used / (farthest or 1.0)
+    points[topology.used_index] = used / (farthest or 1.0)
     lengths = topology.edge_lengths(points)
     lengths = lengths[lengths > 0.0]
     if not len(lengths):

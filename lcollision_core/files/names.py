@@ -13,7 +13,7 @@ from lcollision_core.files.safe import shortened
 from lcollision_core.files.table import FILES
 
 
-def numbered_where_equal(
+def make_unique(
     names: Iterable[str],
     key: Callable[[str], str] = str,
     joined: Callable[[str, str], str] = str.__add__,
@@ -74,7 +74,7 @@ def file_stems(names: Iterable[str]) -> list[str]:
 
     Some file systems ignore case and the encoding of accents.
     """
-    return numbered_where_equal(
+    return make_unique(
         map(file_stem, names),
         _folded,
         lambda stem, ending: _cut(stem, MAX_STEM_BYTES - len(ending)) + ending,

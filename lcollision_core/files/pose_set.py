@@ -455,7 +455,7 @@ def _without_outliers(
     if poses is None or not outliers:
         return collected
     for pose, defect in outliers.items():
-        report(PoseSetError.like(defect, f"pose {poses.names[pose]} of {poses.source}"))
+        report(PoseSetError.from_error(defect, f"pose {poses.names[pose]} of {poses.source}"))
     inliers = [pose for pose in range(len(poses)) if pose not in outliers]
     return replace(collected, pose_set=_only(poses, inliers))
 

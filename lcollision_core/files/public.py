@@ -5,10 +5,10 @@ from lcollision_core.files.character import Character, ClipFrames, Rig
 from lcollision_core.files.character_reading import (
     GltfCharacter,
     as_gltf,
-    as_read,
     is_gltf,
     read_character,
-    turned,
+    with_up_axis,
+    without_user_choices,
     written_frame,
 )
 from lcollision_core.files.mesh_file import (

@@ -21,7 +21,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import HeldElsewhereError, MeshFileError
+from lcollision_core.errors import FileLockedError, MeshFileError
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -97,7 +97,7 @@ def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
 
     Raises
     ------
-    HeldElsewhereError : another holder has not released the lock in time.
+    FileLockedError : another holder has not released the lock in time.
     MeshFileError : the folder is missing, read-only or on a disk without locks.
     """
     target = Path(os.path.realpath(path))
@@ -105,7 +105,7 @@ def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
     give_up = time.monotonic() + wait
     while (file := _taken(lock, path)) is None:
         if time.monotonic() >= give_up:
-            raise HeldElsewhereError(
+            raise FileLockedError(
                 "is being written by another command",
                 "wait for that to end, then try again",
                 where=path,
@@ -252,7 +252,7 @@ def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
             f"the folder {folder}", "cannot be written to", error, "name another"
         ) from error
     except MeshFileError as error:
-        raise MeshFileError.like(
+        raise MeshFileError.from_error(
             error, error.where.replace(str(unfinished), str(target))
         ) from error
     finally:

@@ -30,7 +30,7 @@ from lcollision_core.files.character_reading import character_of
 from lcollision_core.files.gltf.read import read_shown
 from lcollision_core.files.gltf.schema import PARTS, VERTEX_DATA, GltfDocument, stored_parts
 from lcollision_core.files.mesh.polygons import MAX_FILE_BYTES
-from lcollision_core.files.names import numbered_where_equal
+from lcollision_core.files.names import make_unique
 from lcollision_core.files.safe import atomic_write, read_regular
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene.scene import Primitive, ScenePoses, by_node, parents_first
@@ -50,7 +50,7 @@ _CHANGED = ("nodes", "meshes", "skins", "scenes", "scene")
 """Entries of a description that a pose changes, apart from animations."""
 
 
-def sign(
+def add_source_record(
     patch: GltfDocument,
     source: dict[str, Any],
     character: Character,
@@ -421,9 +421,7 @@ def write_character_clips(
         clip_names = [
             str(animation.get("name") or "") for animation in source.patch.objects("animations")
         ]
-        names = numbered_where_equal([*clip_names, *(clip.name for clip in clips)])[
-            len(clip_names) :
-        ]
+        names = make_unique([*clip_names, *(clip.name for clip in clips)])[len(clip_names) :]
         for number, (clip, name) in enumerate(zip(clips, names, strict=True)):
             stored = source.animate(character.rig, clip, name, number)
             for track, frame_vertices in zip(stored, clip.vertices, strict=True):
@@ -499,7 +497,7 @@ class _Source:
         """Return the bytes of the file, with the record of its source; see `sign`."""
         character, source = self._character, self._file.editable.description
         if character.rig is not None:
-            sign(self.patch, source, character, self._shown_by, rules)
+            add_source_record(self.patch, source, character, self._shown_by, rules)
         return self.patch.encoded()
 
     def require_near(self, stored: FloatArray, wanted: npt.NDArray[Any]) -> None:

@@ -12,12 +12,12 @@ import numpy.typing as npt
 
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.contact import STRICT, CollisionDetector, ContactRules
-from lcollision_core.devices import takes_gpu
+from lcollision_core.devices import uses_gpu
 from lcollision_core.embedding import ROWS_PER_BLOCK, Embedding, LatentBox
 from lcollision_core.embedding.bilevel import numbers_of
 from lcollision_core.meshes import FaceGroup
 from lcollision_core.meshes.face_groups import ignored_faces_digest
-from lcollision_core.options import Draws
+from lcollision_core.options import SampleDistribution
 
 if TYPE_CHECKING:
     from lcollision_core.labels.gpu_labeller import GpuLabeller
@@ -26,7 +26,9 @@ BOX_ROWS = 16
 """Number of rows of a mixed block, the first ones, that are samples of the box."""
 
 
-def measures(index: npt.ArrayLike, draws: Draws = Draws.BOX) -> npt.NDArray[np.bool_]:
+def measures(
+    index: npt.ArrayLike, draws: SampleDistribution = SampleDistribution.BOX
+) -> npt.NDArray[np.bool_]:
     """Return which samples measure a predictor: the held-out samples of the box.
 
     Parameters
@@ -37,10 +39,10 @@ def measures(index: npt.ArrayLike, draws: Draws = Draws.BOX) -> npt.NDArray[np.b
     return is_held_out(index) & is_of_box(index, draws)
 
 
-def is_of_box(index: npt.ArrayLike, draws: Draws) -> npt.NDArray[np.bool_]:
+def is_of_box(index: npt.ArrayLike, draws: SampleDistribution) -> npt.NDArray[np.bool_]:
     """Return which samples, by (B,) indices in a store, are uniform samples of the latent box."""
     of_box: npt.NDArray[np.bool_] = np.asarray(index) % ROWS_PER_BLOCK < BOX_ROWS
-    return of_box if draws is Draws.MIXED else np.ones_like(of_box)
+    return of_box if draws is SampleDistribution.MIXED else np.ones_like(of_box)
 
 
 def is_held_out(index: npt.ArrayLike) -> npt.NDArray[np.bool_]:
@@ -138,7 +140,7 @@ class Labeller:
     rules: ContactRules
     groups: tuple[FaceGroup, ...]
     fingerprint: str
-    draws: Draws = Draws.BOX
+    draws: SampleDistribution = SampleDistribution.BOX
 
     @cached_property
     def detector(self) -> CollisionDetector:
@@ -195,7 +197,7 @@ class Labeller:
         """
         number = rows.start // ROWS_PER_BLOCK
         box = self.embedding.box.draw(seed, number)
-        if self.draws is Draws.BOX:
+        if self.draws is SampleDistribution.BOX:
             return (yield box[: len(rows)])
         numbers, draws = numbers_of(seed, number, 1), self.embedding.draws
         drawn = yield np.concatenate(
@@ -243,7 +245,7 @@ class Labeller:
         ShapeError : another shape, or a pose that does not decode to finite vertices.
         """
         codes = np.ascontiguousarray(latent, dtype=np.float32)
-        if not takes_gpu(len(codes), self.embedding.topology.n_faces):
+        if not uses_gpu(len(codes), self.embedding.topology.n_faces):
             return self._label_here(codes)
         n_pairs, energy, left = self._on_gpu.label(codes)
         rows = LabelRows(codes, energy[:, :-1].copy(), energy[:, -1].copy(), n_pairs)
@@ -362,7 +364,7 @@ class StoreIdentity:
     box_high: tuple[float, ...]
     rules: ContactRules = STRICT
     ignored_faces: str = ""
-    draws: Draws = Draws.BOX
+    draws: SampleDistribution = SampleDistribution.BOX
 
     def __post_init__(self) -> None:
         rules = replace(self.rules, near_exclusion=self.near_exclusion)

@@ -28,7 +28,7 @@ from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import from_json, parse_json
 from lcollision_core.labels.labeller import LabelRows, StoreIdentity
 from lcollision_core.model_file import required_array
-from lcollision_core.options import Draws
+from lcollision_core.options import SampleDistribution
 
 FORMAT_VERSION = 3
 """The version that stores are written in, and the only one that is read."""
@@ -105,7 +105,9 @@ class LabelStore:
             ) from error
 
     @classmethod
-    def draws_of(cls, path: str | os.PathLike[str], otherwise: Draws) -> Draws:
+    def draws_of(
+        cls, path: str | os.PathLike[str], otherwise: SampleDistribution
+    ) -> SampleDistribution:
         """Return how a store's samples are drawn, or `otherwise` if no store can be read.
 
         `open_or_make` then refuses a store that cannot be read.

@@ -83,7 +83,7 @@ N_RULES = len(fields(RuleCounts))
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class ExcludedPairs:
     """Pairs that contact rules exclude in the frames of a motion, or in every n-th of a long one.
 
     Attributes
@@ -112,7 +112,7 @@ class LeftOut:
         """
         return max(1, -(-n_frames // _MOST_SEARCHED))
 
-    def with_frame(self, frame: int, counts: RuleCounts, deepest: float) -> LeftOut:
+    def with_frame(self, frame: int, counts: RuleCounts, deepest: float) -> ExcludedPairs:
         """Return a copy with a further searched frame."""
         more = replace(self, searched=self.searched + 1)
         if not counts.total:
@@ -274,7 +274,7 @@ class ContactRules:
         )
         return ", ".join(what for what in descriptions if what)
 
-    def in_short(self) -> str:
+    def summary(self) -> str:
         """List the rules that apply in short, as in "touching at rest, at joints"."""
         applies = {
             "near": self.near_exclusion > 0.0,

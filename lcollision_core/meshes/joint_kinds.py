@@ -47,7 +47,7 @@ class JointKind:
 
     Attributes
     ----------
-    called : name of such a joint for users, without its side
+    label : name of such a joint for users, without its side
     words : pattern of its names, English ones and those of MMD, in lower case letters and digits
     limits : degrees of bend, twist and sideways turn from the rest pose. They are wider than a
         person's, as rest poses differ; a hinge hardly bends backwards.
@@ -57,7 +57,7 @@ class JointKind:
     is_paired : whether a body has one on each side
     """
 
-    called: str
+    label: str
     words: str
     limits: _Limits
     part: str | None = None

@@ -118,7 +118,7 @@ class Limbs:
         turning = np.maximum(self.lengths, _LEAST_SHARE * whole)
         return np.where(whole > 0.0, turning, 1.0) / np.where(whole > 0.0, whole, 1.0)
 
-    def holding(self, vertices: npt.NDArray[np.integer], weights: FloatArray) -> int:
+    def held_segment(self, vertices: npt.NDArray[np.integer], weights: FloatArray) -> int:
         """Return the segment held by a grip: the lowest common ancestor of its vertices' segments.
 
         Parameters
@@ -134,7 +134,7 @@ class Limbs:
         common = next(segment for segment in first if all(segment in other for other in others))
         return self.path(common)[-1] if common in self.bases else common
 
-    def reaches(self, held: int, least: float = 0.0) -> list[list[int]]:
+    def drag_stages(self, held: int, least: float = 0.0) -> list[list[int]]:
         """Return the segments that a drag moves, then those that join in if it cannot reach.
 
         Parameters

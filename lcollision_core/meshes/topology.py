@@ -208,7 +208,7 @@ class Topology:
         return np.setdiff1d(everyone, self.used_vertices, assume_unique=True)
 
     @cached_property
-    def picked(self) -> slice | IntArray:
+    def used_index(self) -> slice | IntArray:
         """Index of the used vertices in an array of all: a slice if all are used."""
         return self.used_vertices if len(self.unused_vertices) else slice(None)
 

@@ -56,7 +56,7 @@ def guess_up(topology: Topology, vertices: npt.NDArray[Any]) -> UpGuess:
     guess : the longest axis if the support is inconclusive
     """
     some = np.linspace(0, len(vertices) - 1, min(len(vertices), _MOST_POSES)).astype(int)
-    poses = [np.asarray(vertices[pose], np.float64)[topology.picked] for pose in some]
+    poses = [np.asarray(vertices[pose], np.float64)[topology.used_index] for pose in some]
     longest = up_axis(np.asarray(vertices[0]), topology)
     scores = np.array([_standing(poses, axis) for axis in range(3)])
     extents = np.median([np.ptp(pose, axis=0) for pose in poses], axis=0)

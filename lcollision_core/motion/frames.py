@@ -16,7 +16,7 @@ import numpy.typing as npt
 from lcollision_core.contact import NearestPair, SelfCollisions
 from lcollision_core.devices import block_size
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
-from lcollision_core.meshes.contact_rules import LeftOut, RuleCounts
+from lcollision_core.meshes.contact_rules import ExcludedPairs, RuleCounts
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.contacts import ContactReport, KeptContacts, Pulls
 from lcollision_core.motion.motion import Motion
@@ -376,7 +376,7 @@ class ScreenedMotion:
     collides_between: tuple[int, ...] | None = None
     least_distance: float | None = None
     least_frame: int | None = None
-    left_out: LeftOut = field(default_factory=LeftOut)
+    left_out: ExcludedPairs = field(default_factory=ExcludedPairs)
     excluded: tuple[FrameExclusions, ...] = ()
 
     @property
@@ -439,7 +439,7 @@ def screen_frames(
     collide : returns which of several frames, or of poses a share of the way to the next, collide,
         faster than `find`; thread-safe
     counted_only : whether to leave out the pairs that the contact rules exclude; if not, they are
-        looked for in every n-th frame: see `LeftOut.step_for`
+        looked for in every n-th frame: see `ExcludedPairs.step_for`
 
     Raises
     ------
@@ -447,7 +447,7 @@ def screen_frames(
     """
     nearest: dict[int, float] = {}
     searched: dict[int, FrameExclusions] = {}
-    step = LeftOut.step_for(len(times))
+    step = ExcludedPairs.step_for(len(times))
     shares = (np.arange(1, substeps + 1) / (substeps + 1)).tolist()
 
     def is_searched(frame: int) -> bool:
@@ -523,7 +523,7 @@ def screen_frames(
             for of in (collides_after, touch_after)
         )
     excluded = tuple(searched[frame] for frame in sorted(searched))
-    left_out = LeftOut(step=step)
+    left_out = ExcludedPairs(step=step)
     for frame in excluded:
         left_out = left_out.with_frame(frame.frame, frame.counts, frame.deepest)
     least = min(nearest, key=lambda frame: (nearest[frame], frame), default=None)

@@ -608,7 +608,7 @@ class PoseDragger:
             raise LCollisionError.must_be(
                 "the body part to twist", f"1 to {space.n_domains}", grip.domain + 1
             )
-        held_joints = limbs.holding(inside, weights)
+        held_joints = limbs.held_segment(inside, weights)
         stays = [
             HeldPatch(grip, np.array(place) / self._check.body_size)
             for pin in pins
@@ -621,12 +621,12 @@ class PoseDragger:
                 HeldPatch(Grip.at(vertex), here[vertex], STANDING_WEIGHT)
                 for vertex in np.concatenate([*stands, []]).astype(int).tolist()
             ]
-        pinned = [limbs.holding(stay.grip.vertices, stay.grip.weights) for stay in stays]
+        pinned = [limbs.held_segment(stay.grip.vertices, stay.grip.weights) for stay in stays]
         if any(held_joints in limbs.limb(end, LEAST_LIMB)[1:] for end in pinned):
             # A pinned hand slows its arm: the trunk helps only once the arm has stopped.
             self._helps_at = _SETTLED, _NEAR
         pinned += [int(limbs.leads[stand.grip.vertex]) for stand in self._stands]
-        reaches = [set(reach) for reach in limbs.reaches(held_joints, least)]
+        reaches = [set(reach) for reach in limbs.drag_stages(held_joints, least)]
         # Twisting a learned model's body part needs its neighbours, as domains turn in space.
         if options.whole_body or (isinstance(grip, Twist) and not limbs.is_relative):
             # A body without a hold would float to the target.

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.contact.kernels import COUNTED
-from lcollision_core.devices import takes_gpu
+from lcollision_core.devices import uses_gpu
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.pose_space import PosesOnGpu, PoseSpace
 
@@ -36,7 +36,7 @@ def colliding_on_gpu(
     -------
     colliding : (B,) bool; None if the check is left to the CPU
     """
-    if detector.clearance > 0.0 or not takes_gpu(len(codes), space.topology.n_faces):
+    if detector.clearance > 0.0 or not uses_gpu(len(codes), space.topology.n_faces):
         return None
     if codes[:, codes.shape[1] - space.n_shapes :].any():
         return None

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError
 from lcollision_core.labels import measures
-from lcollision_core.options import Draws, Limits, require_limits
+from lcollision_core.options import Limits, SampleDistribution, require_limits
 
 Loss = Literal["full", "no-rank", "no-depth", "entropy"]
 """Table 1 of Tan et al. 2021: Ours, entropy+PD, entropy+rank, entropy."""
@@ -141,7 +141,9 @@ class RowSplit:
     held_out: npt.NDArray[np.int64]
 
 
-def split_rows(n_rows: int, config: PredictorConfig, draws: Draws = Draws.BOX) -> RowSplit:
+def split_rows(
+    n_rows: int, config: PredictorConfig, draws: SampleDistribution = SampleDistribution.BOX
+) -> RowSplit:
     """Split the samples 0, 1, ... of a store, drawn in one way.
 
     If there are many held-out rows, a tenth of them choose the decision threshold.
@@ -155,7 +157,10 @@ def split_rows(n_rows: int, config: PredictorConfig, draws: Draws = Draws.BOX) -
 
 
 def held_out_index(
-    n_rows: int, config: PredictorConfig, n_given: int, draws: Draws = Draws.BOX
+    n_rows: int,
+    config: PredictorConfig,
+    n_given: int,
+    draws: SampleDistribution = SampleDistribution.BOX,
 ) -> npt.NDArray[np.int64]:
     """Return the ascending indices of the rows that neither trained nor chose the threshold.
 

@@ -15,7 +15,7 @@ from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.labels import LabelRows, StoreIdentity, is_of_box
 from lcollision_core.meshes import FaceGroup
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.options import Draws
+from lcollision_core.options import SampleDistribution
 from lcollision_core.predictor.config import PRESETS, PredictorConfig, split_rows
 from lcollision_core.predictor.evaluation import score_rows
 from lcollision_core.predictor.metrics import mean_difference
@@ -157,7 +157,7 @@ def train_predictor(
 
     config = PRESETS["default"] if config is None else config
     require_model(rows, embedding)
-    draws = Draws.BOX if store is None else store.draws
+    draws = SampleDistribution.BOX if store is None else store.draws
     split = split_rows(len(rows), config, draws)
     energy = rows.energy[split.training]
     colliding = rows.colliding[split.training]

@@ -55,17 +55,17 @@ class OpenedCharacter:
         """Return the transforms of the rig's joints from the client's (..., J, 4, 4) ones."""
         n = len(self.joint_names)
         values = given.numbers("transforms", (*leading, n, 4, 4))
-        return _with_still(values)[..., self.joints, :, :]
+        return _with_identity(values)[..., self.joints, :, :]
 
-    def shown(self, given: Array, *leading: int | None) -> FloatArray:
+    def joined_vertices(self, given: Array, *leading: int | None) -> FloatArray:
         """Return the client's (..., W, 3) vertices as (..., V, 3) joined ones."""
         return given.numbers("vertices", (*leading, self.n_vertices, 3))[..., self.vertices, :]
 
     def parts_of(self, joints: list[str]) -> frozenset[int]:
-        """Return the body parts that joints belong to; see `numbers_of`."""
-        return frozenset(self.body.space.part_of_joint[self.numbers_of(joints)].tolist())
+        """Return the body parts that joints belong to; see `joint_indices`."""
+        return frozenset(self.body.space.part_of_joint[self.joint_indices(joints)].tolist())
 
-    def numbers_of(self, joints: list[str]) -> IntArray:
+    def joint_indices(self, joints: list[str]) -> IntArray:
         """Return the rig's indices of joints given by name.
 
         Raises
@@ -165,7 +165,7 @@ _SAME = 1e-7
 sizes."""
 
 
-def hash_of(message: Open | OpenMesh) -> str:
+def character_id(message: Open | OpenMesh) -> str:
     """Return the id of a character: a hash of its file, or of its arrays.
 
     Raises
@@ -234,7 +234,7 @@ def open_arrays(message: OpenMesh) -> OpenedCharacter:
     if message.poses is not None:
         poses = message.poses.numbers("poses", (None, n, 4, 4))[:_MOST_POSES]
         unmoved = tuple(np.zeros((len(poses), 0)) for _ in parts)
-        character = _with_poses(character, ScenePoses(_with_still(poses), unmoved))
+        character = _with_poses(character, ScenePoses(_with_identity(poses), unmoved))
     body = open_body(character)
     assert isinstance(body, RigBody)
     return _opened(body, tuple(message.joints), nodes)
@@ -264,7 +264,7 @@ def _further(message: OpenMesh, character: Character) -> list[FaceGroup]:
     ]
 
 
-def _with_still(transforms: FloatArray) -> FloatArray:
+def _with_identity(transforms: FloatArray) -> FloatArray:
     """Append an identity transform to (..., J, 4, 4) transforms."""
     still = np.broadcast_to(np.eye(4), (*transforms.shape[:-3], 1, 4, 4))
     return np.concatenate([transforms, still], axis=-3)

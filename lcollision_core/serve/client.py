@@ -33,7 +33,7 @@ _LOOK = 0.5
 _GONE = "the engine is gone"
 
 Reply = dict[str, Any]
-Told = Callable[[int, int], None]
+ProgressCallback = Callable[[int, int], None]
 
 
 class EngineError(Exception):
@@ -56,7 +56,7 @@ def wrapped(values: Any) -> Reply:
 class Request:
     """A request that was sent, and its answer once that has come."""
 
-    def __init__(self, number: int, progress: Told | None, limit: float) -> None:
+    def __init__(self, number: int, progress: ProgressCallback | None, limit: float) -> None:
         self.number, self._progress = number, progress
         self._limit, self._heard = limit, time.monotonic()
         self._done = threading.Event()
@@ -89,7 +89,7 @@ class Request:
             raise EngineCancelled("cancelled")
         return self._reply
 
-    def take(self, reply: Reply) -> None:
+    def handle_reply(self, reply: Reply) -> None:
         """Handle a message of the engine, in the reader's thread."""
         self._heard = time.monotonic()
         if reply["type"] == "progress":
@@ -164,7 +164,7 @@ class Engine:
         """Whether the engine still answers."""
         return not self._gone
 
-    def send(self, kind: str, progress: Told | None = None, **values: Any) -> Request:
+    def send(self, kind: str, progress: ProgressCallback | None = None, **values: Any) -> Request:
         """Send a request without waiting; values with a buffer are sent as arrays.
 
         Raises
@@ -174,7 +174,9 @@ class Engine:
         limit = _LONG_LIMIT if kind.startswith("resolve") else _LIMIT
         return self._send(kind, progress, limit, values)
 
-    def _send(self, kind: str, progress: Told | None, limit: float, values: Reply) -> Request:
+    def _send(
+        self, kind: str, progress: ProgressCallback | None, limit: float, values: Reply
+    ) -> Request:
         fields = {key: _plain(value) for key, value in values.items() if value is not None}
         with self._lock:
             if self._gone:
@@ -191,7 +193,7 @@ class Engine:
             self._messages.put(_MARK + _LENGTH.pack(len(message)) + message)
         return request
 
-    def ask(self, kind: str, progress: Told | None = None, **values: Any) -> Reply:
+    def ask(self, kind: str, progress: ProgressCallback | None = None, **values: Any) -> Reply:
         """Send a request and wait for the answer: see `send` and `Request.result`."""
         return self.send(kind, progress, **values).result()
 
@@ -258,7 +260,7 @@ class Engine:
                 if request is not None:
                     if reply["type"] != "progress":
                         del self._waiting[request.number]
-                    request.take(reply)
+                    request.handle_reply(reply)
         except Exception as error:  # no request may wait for ever
             reason = f"{_GONE}: {error}"
         self._fail(reason, is_gone=True)
@@ -270,7 +272,7 @@ class Engine:
                 self._gone = self._gone or message
             left, self._waiting = list(self._waiting.values()), {}
         for request in left:
-            request.take({"type": "error", "message": message})
+            request.handle_reply({"type": "error", "message": message})
 
     def _replies(self) -> Iterator[Reply]:
         while True:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from msgspec import Meta, Struct
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.json_values import typed
+from lcollision_core.json_values import convert_checked
 from lcollision_core.options import LARGEST_CHANGE
 
 PROTOCOL_VERSION: Final = 1
@@ -153,15 +153,15 @@ class OpenMesh(_Request, tag="open_mesh"):
     metres: Annotated[float, Meta(gt=0.0, lt=1e9)] = 1.0
 
 
-class _OfCharacter(_Request, kw_only=True):
+class _CharacterRequest(_Request, kw_only=True):
     character: Name
 
 
-class GetRules(_OfCharacter, tag="rules"):
+class GetRules(_CharacterRequest, tag="rules"):
     """Return the contact rules, and the groups of faces that they may name."""
 
 
-class SetRules(_OfCharacter, tag="set_rules"):
+class SetRules(_CharacterRequest, tag="set_rules"):
     """Set the contact rules, named as in `ContactRules`; missing ones are off."""
 
     rules: dict[str, Any]
@@ -171,7 +171,7 @@ Clearance = Annotated[float, Meta(ge=0.0, lt=1.0)]
 LargestChange = Annotated[float, Meta(gt=0.0)]
 
 
-class Check(_OfCharacter, tag="check"):
+class Check(_CharacterRequest, tag="check"):
     """Check a pose.
 
     Attributes
@@ -188,7 +188,7 @@ class Check(_OfCharacter, tag="check"):
     clearance: Clearance = 0.0
 
 
-class Drag(_OfCharacter, tag="drag"):
+class Drag(_CharacterRequest, tag="drag"):
     """Begin or continue to drag a vertex of a pose towards a point.
 
     Attributes
@@ -208,7 +208,7 @@ class Drag(_OfCharacter, tag="drag"):
 Beyond = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
-class ResolvePose(_OfCharacter, tag="resolve_pose"):
+class ResolvePose(_CharacterRequest, tag="resolve_pose"):
     """Find the nearest free pose.
 
     Attributes
@@ -235,7 +235,7 @@ class ResolvePose(_OfCharacter, tag="resolve_pose"):
     least_change: Clearance = 0.0
 
 
-class ResolveMotion(_OfCharacter, tag="resolve_motion"):
+class ResolveMotion(_CharacterRequest, tag="resolve_motion"):
     """Resolve the colliding spans of a motion.
 
     Attributes
@@ -268,7 +268,7 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
     least_change: Clearance = 0.0
 
 
-class ProposeRules(_OfCharacter, tag="propose_rules"):
+class ProposeRules(_CharacterRequest, tag="propose_rules"):
     """Propose places to leave out of the check because they touch in nearly every pose.
 
     Attributes
@@ -286,7 +286,7 @@ class Cancel(_Request, tag="cancel"):
     request: Count
 
 
-class Close(_OfCharacter, tag="close"):
+class Close(_CharacterRequest, tag="close"):
     """Forget a character."""
 
 
@@ -353,7 +353,7 @@ def _sentence(error: msgspec.ValidationError, values: Any) -> str:
         return f"the message{unknown[2] or ''} has an unknown field {unknown[1][:_SHOWN]!r}"
     try:
         kind: Any = Request
-        typed(kind, values, "the message")
+        convert_checked(kind, values, "the message")
     except ValueError as refusal:
         return str(refusal)
     except (LookupError, TypeError):

@@ -16,15 +16,15 @@ from typing import Any, BinaryIO, cast
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import Job, at_most_every
 from lcollision_core.serve import messages as m
-from lcollision_core.serve.characters import OpenedCharacter, hash_of, open_arrays, open_file
+from lcollision_core.serve.characters import OpenedCharacter, character_id, open_arrays, open_file
 from lcollision_core.serve.framing import FrameReader, framed
 from lcollision_core.serve.work import (
     Dragging,
+    answer_resolve_motion,
     check_pose,
     describe,
     propose,
     resolve_pose,
-    resolve_whole,
 )
 
 _BETWEEN_PROGRESS = 0.1
@@ -32,7 +32,7 @@ _BETWEEN_PROGRESS = 0.1
 
 _LONG: dict[type, Callable[..., dict[str, Any]]] = {
     m.ResolvePose: resolve_pose,
-    m.ResolveMotion: resolve_whole,
+    m.ResolveMotion: answer_resolve_motion,
     m.ProposeRules: propose,
 }
 """Long work, which runs beside other requests."""
@@ -187,7 +187,7 @@ class Session:
                 body = opened.body.with_rules(ContactRules.from_json(request.rules))
                 self._characters[request.character] = replace(opened, body=body)
                 self._dragging = None
-                return {"rules": body.rules.to_json(), "in_words": body.rules.in_short()}
+                return {"rules": body.rules.to_json(), "in_words": body.rules.summary()}
             case m.Check():
                 return check_pose(opened, request)
             case m.Drag():
@@ -202,7 +202,7 @@ class Session:
         raise AssertionError(request)
 
     def _open(self, request: m.Open | m.OpenMesh) -> Reply:
-        digest = hash_of(request)
+        digest = character_id(request)
         # A character that is already open keeps its rules.
         opened = self._characters.get(digest)
         if opened is None:

@@ -51,7 +51,7 @@ def describe(opened: OpenedCharacter) -> Reply:
         "faces": len(opened.faces),
         "body_size": body.body_size,
         "rules": body.rules.to_json(),
-        "in_words": body.rules.in_short(),
+        "in_words": body.rules.summary(),
         "notes": list(body.notes),
     }
 
@@ -64,7 +64,7 @@ def check_pose(opened: OpenedCharacter, request: m.Check) -> Reply:
     if request.transforms is not None:
         transforms = opened.transforms(request.transforms)
     if request.vertices is not None:
-        vertices = opened.shown(request.vertices)
+        vertices = opened.joined_vertices(request.vertices)
     off = 0.0
     if transforms is not None:
         by_rig = space.skinned(transforms)
@@ -77,7 +77,7 @@ def check_pose(opened: OpenedCharacter, request: m.Check) -> Reply:
     nearest = exact.least_distance(vertices) if request.clearance > 0.0 else None
     collisions, touches = exact.find(vertices, counted_only=False), False
     if request.before is not None and not collisions.colliding:
-        touches = exact.collide_between(opened.shown(request.before), vertices)
+        touches = exact.collide_between(opened.joined_vertices(request.before), vertices)
     return {
         **_verdict(opened, collisions),
         "touches_between": touches,
@@ -181,7 +181,7 @@ def resolve_pose(opened: OpenedCharacter, request: m.ResolvePose, job: Job) -> R
     }
 
 
-def resolve_whole(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -> Reply:
+def answer_resolve_motion(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -> Reply:
     """Resolve the colliding spans of a motion."""
     start = time.perf_counter()
     body = opened.body
@@ -261,7 +261,7 @@ def _with_few_turns(
 def _options(opened: OpenedCharacter, request: m.ResolvePose | m.ResolveMotion) -> ResolveOptions:
     locked: list[int] = []
     if request.turning is not None:
-        joints = opened.numbers_of(request.turning)
+        joints = opened.joint_indices(request.turning)
         locked = np.flatnonzero(~opened.body.space.codes_of_joints(joints)).tolist()
     return ResolveOptions(
         locked_domains=opened.parts_of(request.locked),
@@ -273,7 +273,9 @@ def _options(opened: OpenedCharacter, request: m.ResolvePose | m.ResolveMotion) 
 
 def propose(opened: OpenedCharacter, request: m.ProposeRules, job: Job) -> Reply:
     """Propose places to leave out of the check because they touch in nearly every pose."""
-    shown_vertices = None if request.vertices is None else opened.shown(request.vertices, None)
+    shown_vertices = (
+        None if request.vertices is None else opened.joined_vertices(request.vertices, None)
+    )
     proposed = propose_rules(opened.body, job, shown_vertices)
     if proposed is None:
         return {"touching": []}
@@ -299,7 +301,7 @@ def _motion(
     transforms = opened.transforms(given, *(() if n is None else (n,)))
     vertices = None
     if shown is not None:
-        vertices = opened.shown(shown, *(() if n is None else (n,)))
+        vertices = opened.joined_vertices(shown, *(() if n is None else (n,)))
     if times is None:
         times, transforms = np.zeros(1), transforms[None]
         vertices = None if vertices is None else vertices[None]

@@ -118,7 +118,7 @@ def offered_rules(body: Body, job: Job) -> tuple[ProposedRules | None, bool]:
     is_offered : whether there is a proposal that the user has not declined before
     """
     from lcollision_core.bodies import propose_rules
-    from lcollision_core.bodies.known import is_offer_declined
+    from lcollision_core.bodies.remembered import is_offer_declined
 
     proposed = propose_rules(body, job)
     return proposed, proposed is not None and not is_offer_declined(body)

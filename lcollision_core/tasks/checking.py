@@ -63,7 +63,7 @@ class CheckRequest:
     error_bound : largest share of wrong verdicts, measured on samples of a learned body's latent
         box, for which the estimate may replace the check of free frames
     scene : other bodies beside the mesh or the character
-    joints : a file that matches the body's joints to a motion's: see `following`
+    joints : a file that matches the body's joints to a motion's: see `with_joint_map`
     """
 
     rules: RuleOptions = field(default_factory=RuleOptions)
@@ -238,7 +238,7 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
     CancelledError : the job was cancelled.
     """
     from lcollision_core.bodies import open_body
-    from lcollision_core.bodies.partners import following
+    from lcollision_core.bodies.partners import with_joint_map
     from lcollision_core.bodies.scene_file import body_of_scene
 
     if request.scene.has_others or is_scene_file(path):
@@ -248,7 +248,7 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
     if request.body is not None:
         body = open_body(request.body)
         if request.joints is not None:
-            body = following(body, request.joints)
+            body = with_joint_map(body, request.joints)
         return _check_poses(body_of_motion(body, path, job), path, request, job)
     document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
     if document is None:

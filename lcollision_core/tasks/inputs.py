@@ -199,7 +199,7 @@ def with_rules_of_character(poses: PoseSet, path: Path) -> PoseSet:
 
 
 @dataclass(frozen=True, eq=False)
-class GivenPose:
+class InputPose:
     """An input pose of a task.
 
     Attributes
@@ -214,9 +214,9 @@ class GivenPose:
     mesh: npt.NDArray[np.float64] | None = None
 
 
-def read_given(
+def read_input_poses(
     body: Body, paths: Sequence[Path], scale: float, job: Job = UNWATCHED
-) -> tuple[list[GivenPose], bool]:
+) -> tuple[list[InputPose], bool]:
     """Read the poses of files, encoding meshes; note why other files cannot be read.
 
     Returns
@@ -226,7 +226,7 @@ def read_given(
     """
     from lcollision_core.bodies import unique_names
 
-    given: list[GivenPose] = []
+    given: list[InputPose] = []
     failed = False
     for done, path in enumerate(paths):
         try:
@@ -242,12 +242,12 @@ def read_given(
     ], failed
 
 
-def _given_in(body: Body, path: Path, scale: float, job: Job) -> Iterator[GivenPose]:
+def _given_in(body: Body, path: Path, scale: float, job: Job) -> Iterator[InputPose]:
     from lcollision_core.bodies import encode_mesh, read_model_mesh
 
     if path.suffix.lower() == ".json":
         for pose in read_some_poses(path, body):
-            yield GivenPose(f"{path}: {pose.name}", pose)
+            yield InputPose(f"{path}: {pose.name}", pose)
         return
     mesh = read_model_mesh(path, body)
     if mesh.coarseness:
@@ -258,7 +258,7 @@ def _given_in(body: Body, path: Path, scale: float, job: Job) -> Iterator[GivenP
         raise cannot_encode(path, error) from error
     error_text = fit_error(pose.fit_error_mean, pose.fit_error_max)
     job.note(say("{file} is encoded with a {error}", file=path, error=error_text))
-    yield GivenPose(str(path), pose, mesh.vertices)
+    yield InputPose(str(path), pose, mesh.vertices)
 
 
 def encode_meshes(

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.bodies import LearnedBody, save_trained
-from lcollision_core.bodies.judging import CARD_POSES, places_of, propose_rules, score_kinds
+from lcollision_core.bodies.scoring import CARD_POSES, places_of, propose_rules, score_kinds
 from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox
 from lcollision_core.embedding.bilevel import BOX_SCALE
 from lcollision_core.embedding.training_run import EmbeddingConfig
@@ -169,7 +169,7 @@ class Pace:
         self._began = time.monotonic()
         self._behind = self._skipped = self._seconds_behind(self._stage, 1.0)
 
-    def tell(self, stage: Stage, stage_done: float, facts: Sequence[str] = ()) -> None:
+    def report(self, stage: Stage, stage_done: float, facts: Sequence[str] = ()) -> None:
         """Report progress within a stage.
 
         Progress in the first reports of a stage was made by an earlier process.
@@ -344,7 +344,7 @@ class MostlyCollidingError(LCollisionError):
         )
 
 
-def look_again(
+def adapt_to_samples(
     model: LearnedBody,
     request: LearningRequest,
     job: Job = UNWATCHED,
@@ -468,7 +468,7 @@ def learn_model(work: WorkFolder, job: Job = UNWATCHED) -> LearnedCard:
         status.
     CancelledError : the job was cancelled.
     """
-    with work.held():
+    with work.lock():
         return _Learner(work, job).run()
 
 
@@ -571,13 +571,13 @@ class LearnedPredictor:
         """Return a body of the same latent space with this predictor and the free poses."""
         return body.with_predictor(self.predictor).with_free_poses(self.free_poses)
 
-    def judged(self, n_poses: int, seed: int, job: Job = UNWATCHED) -> LearnedPredictor:
+    def with_scores(self, n_poses: int, seed: int, job: Job = UNWATCHED) -> LearnedPredictor:
         """Return a copy with the predictor's scores on kinds of poses: see `score_kinds`."""
         kinds = score_kinds(self.of(self.body), n_poses, seed, job)
-        judged = replace(self, predictor=replace(self.predictor, kinds=kinds))
+        scored = replace(self, predictor=replace(self.predictor, kinds=kinds))
         # Avoid finding them again.
-        judged.__dict__["free_poses"] = self.free_poses
-        return judged
+        scored.__dict__["free_poses"] = self.free_poses
+        return scored
 
 
 class _Learner:
@@ -598,7 +598,7 @@ class _Learner:
         work = self._work
         # An earlier process may have been killed after this.
         path = work.destination
-        if work.made(self._request) is None:
+        if work.finished_model(self._request) is None:
             try:
                 path = self._make()
             except CancelledError:
@@ -611,7 +611,7 @@ class _Learner:
                 self._leave(RunState.FAILED, str(error))
                 raise
         card = card_of(LearnedBody.load(path), str(path))
-        work.tell(
+        work.write_status(
             LearningStatus(
                 RunState.DONE,
                 Stage.PREDICTOR,
@@ -701,7 +701,7 @@ class _Learner:
             checkpoint=checkpoint,
             job=self._job.part(told),
         )
-        model, first = look_again(model, request, self._part(_TRAINED))
+        model, first = adapt_to_samples(model, request, self._part(_TRAINED))
         provenance = {
             **model.card.provenance,
             "notes": [*poses.notes, *notes_of(first)],
@@ -714,7 +714,7 @@ class _Learner:
 
     def _predictor(self, model: LearnedBody) -> Path:
         from lcollision_core.labels import LabelStore, label_poses
-        from lcollision_core.options import Draws
+        from lcollision_core.options import SampleDistribution
 
         work, effort, seed = self._work, self._effort, self._request.seed
         self._enter(Stage.LABELS)
@@ -725,7 +725,7 @@ class _Learner:
             self._at(status.done / status.total, facts)
 
         label_poses(
-            model.labeller(Draws.MIXED),
+            model.labeller(SampleDistribution.MIXED),
             work.labels,
             effort.n_samples,
             seed=seed,
@@ -750,7 +750,7 @@ class _Learner:
             seed=seed,
             job=self._job.part(told_epochs),
         )
-        finished = learned.judged(effort.n_judged, seed, self._part(_PASSES)).of(model)
+        finished = learned.with_scores(effort.n_judged, seed, self._part(_PASSES)).of(model)
         provenance = {**finished.card.provenance, "seconds": self._seconds()}
         finished = finished.with_card(replace(finished.card, provenance=provenance))
         return save_trained(work.destination, None, finished)
@@ -773,7 +773,7 @@ class _Learner:
         )
 
     def _at(self, stage_done: float, facts: Sequence[str] = ()) -> None:
-        self._pace.tell(self._stage, stage_done, facts)
+        self._pace.report(self._stage, stage_done, facts)
 
     def _tell(self, status: LearningStatus) -> None:
         self._job.report(status)
@@ -782,10 +782,10 @@ class _Learner:
             self._noted = now
             # A full disk must stop real work, but not a status update.
             with suppress(MeshFileError):
-                self._work.tell(replace(status, seconds=self._seconds()))
+                self._work.write_status(replace(status, seconds=self._seconds()))
 
     def _leave(self, state: RunState, sentence: str = "", **more: Any) -> None:
         """Write the final status, unless the disk is too full even for that."""
         last = replace(self._work.status, seconds=self._seconds(), seconds_left=None)
         with suppress(MeshFileError):
-            self._work.tell(replace(last, state=state, sentence=sentence, **more))
+            self._work.write_status(replace(last, state=state, sentence=sentence, **more))

@@ -69,10 +69,10 @@ def open_motions(body: Body, path: Path, job: Job) -> OpenedMotions:
     LCollisionError : the file can't be read, or the body can't follow its motion.
     """
     from lcollision_core.bodies.motions import body_of_motion as in_shape
-    from lcollision_core.bodies.motions import is_carried
+    from lcollision_core.bodies.motions import is_retargeted
     from lcollision_core.bodies.retargeting import joint_match
 
-    joints = joint_match(body, path) if is_carried(body, path) else None
+    joints = joint_match(body, path) if is_retargeted(body, path) else None
     try:
         shaped, notes = in_shape(body, path)
     except MeshFileError:

@@ -30,7 +30,7 @@ from lcollision_core.tasks.exporting import (
     source_files,
     write_result,
 )
-from lcollision_core.tasks.inputs import PARTIAL, GivenPose, body_of_motion, motion_files
+from lcollision_core.tasks.inputs import PARTIAL, InputPose, body_of_motion, motion_files
 from lcollision_core.tasks.job import Run, depends_on, key_of, run_of_poses, run_of_rows
 from lcollision_core.tasks.verdicts import FailedFile, ResolvedClip
 from lcollision_core.tasks.words import counted, say, say_number
@@ -71,7 +71,7 @@ class ResolvePosesRequest:
     """
 
     body: Body
-    given: Sequence[GivenPose]
+    given: Sequence[InputPose]
     output: Output
     options: ResolveOptions
     export: ExportRequest
@@ -92,7 +92,7 @@ class ResolvedPose:
     stays_free : whether a free pose is still free as stored in the source file's form
     """
 
-    given: GivenPose
+    given: InputPose
     result: ResolveResult
     file: Path
     has_detail: bool
@@ -206,7 +206,7 @@ def _known_results(body: Body, run: Run[KeptPose]) -> dict[int, ResolveResult]:
 
 def _detailed(
     body: Body,
-    given: Sequence[GivenPose],
+    given: Sequence[InputPose],
     results: Sequence[ResolveResult],
     clearance: float,
     job: Job,
@@ -227,7 +227,7 @@ def _detailed(
 
 
 def _stays_free(
-    body: Body, given: GivenPose, result: ResolveResult, file: WrittenPose, job: Job
+    body: Body, given: InputPose, result: ResolveResult, file: WrittenPose, job: Job
 ) -> bool:
     """Check a free pose as stored in the source file's form, and note collisions by rounding."""
     if not result.exactly_free or file.vertices is None:
@@ -598,7 +598,7 @@ def _require_output(
     output: Output, body: Body, files: Sequence[Path], motions: Sequence[Motion]
 ) -> None:
     """Raise early if an output cannot hold the motions."""
-    from lcollision_core.bodies.motions import character_of_motion, is_carried, is_of_skeleton
+    from lcollision_core.bodies.motions import character_of_motion, is_of_skeleton, is_retargeted
     from lcollision_core.bodies.retargeting import require_skeleton
     from lcollision_core.files.table import BVH_SUFFIX, OWN_SUFFIXES
     from lcollision_core.files.written import require_written
@@ -609,7 +609,7 @@ def _require_output(
     if suffix in OWN_SUFFIXES and output.form == "mesh":
         is_own = files[0].suffix.lower() == suffix and is_of_skeleton(files[0])
         # A retargeted SMPL motion cannot hold the body's joints.
-        is_own = is_own and (suffix == BVH_SUFFIX or not is_carried(body, files[0]))
+        is_own = is_own and (suffix == BVH_SUFFIX or not is_retargeted(body, files[0]))
         if len(files) > 1 or not is_own:
             raise MeshFileError.unwritable(
                 output.path,
@@ -618,7 +618,7 @@ def _require_output(
             )
     elif output.form == "mesh":
         character = character_of_motion(body, files[0]) if len(files) == 1 else None
-        if character is None and all(is_carried(body, file) for file in files):
+        if character is None and all(is_retargeted(body, file) for file in files):
             character = body.character
         if character is None:
             raise MeshFileError.unwritable(
@@ -724,13 +724,13 @@ def _write_clips(
     job: Job,
 ) -> None:
     """Write the character's file with changed clips, or with retargeted motions as new ones."""
-    from lcollision_core.bodies.motions import is_carried, write_clips, write_new_clips
+    from lcollision_core.bodies.motions import is_retargeted, write_clips, write_new_clips
 
     with locked(output.path):
         path = output.path
         if file_stamp(path) != output.before:
             path = unused_name(path)
-        if path.suffix.lower() in SCENE_SUFFIXES and is_carried(body, file):
+        if path.suffix.lower() in SCENE_SUFFIXES and is_retargeted(body, file):
             written = write_new_clips(path, body, [change.after for change in changes])
         else:
             written = write_clips(path, body, file, changes)
@@ -931,7 +931,7 @@ def motion_outputs(
     root : input folder; its subfolders are kept
     """
     from lcollision_core.bodies import unique_names
-    from lcollision_core.bodies.motions import is_carried, is_of_skeleton
+    from lcollision_core.bodies.motions import is_of_skeleton, is_retargeted
     from lcollision_core.files.table import BVH_SUFFIX, OWN_SUFFIXES
 
     by_folder: dict[Path, list[tuple[Path, str]]] = {}
@@ -943,7 +943,7 @@ def motion_outputs(
         elif suffix not in (".json", ".mdd") and not (
             suffix in OWN_SUFFIXES
             and is_of_skeleton(path)
-            and (suffix == BVH_SUFFIX or not is_carried(body, path))
+            and (suffix == BVH_SUFFIX or not is_retargeted(body, path))
         ):
             suffix = ".pc2"
         inside = folder if root is None else folder / path.parent.relative_to(root)

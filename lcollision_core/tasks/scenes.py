@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from lcollision_core.bodies import Body, NamedPose
     from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember
     from lcollision_core.motion import Motion
-    from lcollision_core.tasks.inputs import GivenPose
+    from lcollision_core.tasks.inputs import InputPose
     from lcollision_core.tasks.resolving import ResolveMotionsRequest
     from lcollision_core.tasks.verdicts import ResolvedClip
 
@@ -116,7 +116,7 @@ def _height(given: str | None, held: float | str | None) -> float | str | None:
     return height
 
 
-def beside_each_other(files: Sequence[Path]) -> SceneFile:
+def scene_of_files(files: Sequence[Path]) -> SceneFile:
     """Return the scene of files opened together, each body beside the previous one.
 
     Raises
@@ -206,9 +206,9 @@ def parts_text(body: Body, pairs: npt.NDArray[np.integer]) -> list[str]:
 # Poses.
 
 
-def given_of_scene(
+def read_scene_poses(
     body: SceneBody, files: Sequence[Path], scale: float, job: Job = UNWATCHED
-) -> list[GivenPose]:
+) -> list[InputPose]:
     """Read poses of a scene or of its bodies; each file is of the first body that it fits.
 
     Bodies without a file stay at rest; without files, the scene is at rest.
@@ -219,7 +219,7 @@ def given_of_scene(
     """
     from lcollision_core.bodies import NamedPose
     from lcollision_core.bodies.poses import OtherModelError, read_poses
-    from lcollision_core.tasks.inputs import GivenPose, read_some_poses
+    from lcollision_core.tasks.inputs import InputPose, read_some_poses
 
     poses_of: dict[str, list[NamedPose]] = {}
     sources: list[str] = []
@@ -230,7 +230,7 @@ def given_of_scene(
             except OtherModelError:
                 whole = ()
             if whole:
-                return [GivenPose(f"{path}: {pose.name}", pose) for pose in whole]
+                return [InputPose(f"{path}: {pose.name}", pose) for pose in whole]
         failure: LCollisionError | None = None
         for member in body.members:
             if not member.moves or member.name in poses_of:
@@ -265,7 +265,7 @@ def given_of_scene(
         ]
         name = f"scene {number + 1}" if n_poses > 1 else "scene"
         pose = NamedPose(name, body.joined_codes(codes))
-        poses.append(GivenPose(" + ".join(sources) or body.name, pose))
+        poses.append(InputPose(" + ".join(sources) or body.name, pose))
     return poses
 
 
@@ -456,7 +456,7 @@ def write_member_motions(
     from lcollision_core.bodies import write_sequence
     from lcollision_core.bodies.motions import (
         MotionChange,
-        is_carried,
+        is_retargeted,
         write_clips,
         write_new_clips,
     )
@@ -480,7 +480,7 @@ def write_member_motions(
             new = body.codes_of_member(member.name, after.codes)
             old = body.codes_of_member(member.name, before.codes)
             motion = one.motion
-            is_own = one.file is not None and not is_carried(member.body, one.file)
+            is_own = one.file is not None and not is_retargeted(member.body, one.file)
             if motion is None or not is_own:
                 name = before.name if motion is None else motion.name
                 write_new_clips(path, member.body, [Motion(name, after.times, new)])

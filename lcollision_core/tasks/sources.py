@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.bodies import RigBody, poses_by_rig, rest_pose_set
-from lcollision_core.bodies.known import with_remembered
+from lcollision_core.bodies.remembered import with_remembered
 from lcollision_core.bodies.rig_body import MOST_NEAR_PAIRS
 from lcollision_core.bodies.skeletons import rig_of
 from lcollision_core.contact import CollisionDetector, touching_patches

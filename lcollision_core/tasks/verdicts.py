@@ -50,7 +50,7 @@ class CheckedMesh:
 class CheckedFrame:
     """One frame of a clip with colliding pairs; depths are normalised.
 
-    Excluded pairs are None if not searched for: see `LeftOut.step_for`.
+    Excluded pairs are None if not searched for: see `ExcludedPairs.step_for`.
     """
 
     frame: int

@@ -146,7 +146,7 @@ def mirrored_text(mirrored: MirroredPose) -> str:
             "no collisions (checked), after {n} pair of faces of the mirror image was resolved",
             "no collisions (checked), after {n} pairs of faces of the mirror image were resolved",
         )
-    elif mirrored.lost_freedom:
+    elif mirrored.collides_newly:
         state = say_number(
             mirrored.pairs_after,
             "colliding: {n} pair of faces that the original doesn't have",

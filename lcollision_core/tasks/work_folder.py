@@ -17,7 +17,7 @@ from typing import Any
 from lcollision_core.bodies import LearnedBody, list_models, user_models_folder
 from lcollision_core.bodies.learned_body import WORK_SUFFIX, work_path
 from lcollision_core.errors import (
-    HeldElsewhereError,
+    FileLockedError,
     LCollisionError,
     MeshFileError,
     ModelFileError,
@@ -106,8 +106,8 @@ class WorkFolder:
             raise MeshFileError.because(
                 self.path, "cannot be made", error, "choose another place for the model"
             ) from error
-        with self.held():
-            self.made(request)
+        with self.lock():
+            self.finished_model(request)
             if (self.path / "request.json").exists() and self.request != request:
                 # A failed run may change its request before it has poses, or if nearly all samples
                 # collided, such as to ignore parts.
@@ -122,7 +122,7 @@ class WorkFolder:
                 (self.path / "status.json").unlink(missing_ok=True)
             self._write("request.json", to_json(request))
 
-    def made(self, request: LearningRequest) -> LearnedBody | None:
+    def finished_model(self, request: LearningRequest) -> LearnedBody | None:
         """Return the model made from a request, None if none of that name exists.
 
         Raises
@@ -162,7 +162,7 @@ class WorkFolder:
         except (OSError, ValueError, LCollisionError) as error:
             raise ModelFileError.unreadable(path, error, f"remove {self.path}") from error
 
-    def go_on_regardless(self) -> None:
+    def allow_mostly_colliding(self) -> None:
         """Let a run that stopped because nearly all samples collide continue when resumed.
 
         Raises
@@ -180,7 +180,7 @@ class WorkFolder:
         except (OSError, ValueError, LCollisionError):
             return LearningStatus(RunState.STOPPED)
 
-    def tell(self, status: LearningStatus) -> None:
+    def write_status(self, status: LearningStatus) -> None:
         """Write the progress of the run, atomically.
 
         Raises
@@ -190,7 +190,7 @@ class WorkFolder:
         self._write("status.json", asdict(status))
 
     @contextmanager
-    def held(self, wait: float = 5.0) -> Iterator[None]:
+    def lock(self, wait: float = 5.0) -> Iterator[None]:
         """Lock the run against other processes.
 
         Raises
@@ -201,7 +201,7 @@ class WorkFolder:
         with ExitStack() as stack:
             try:
                 stack.enter_context(locked(self.path / "run", wait))
-            except HeldElsewhereError as error:
+            except FileLockedError as error:
                 raise ModelFileError(
                     f"a model {self.name!r} is being learned by another process",
                     "wait for it, or stop it first",
@@ -209,12 +209,12 @@ class WorkFolder:
             yield
 
     @property
-    def is_held(self) -> bool:
+    def is_locked(self) -> bool:
         """Whether a process holds the lock; writes nothing, so it works on a full disk."""
         if not (self.path / ".run.lock").exists():
             return False
         try:
-            with self.held(wait=0.0):
+            with self.lock(wait=0.0):
                 return False
         except ModelFileError:
             return True

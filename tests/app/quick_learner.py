@@ -34,13 +34,13 @@ learner._NICENESS = 1
 def slow_down() -> None:
     """Slow down each progress report, so that a test can act in between."""
     seconds = float(os.environ.get("SECONDS_PER_STEP", "0"))
-    tell = Pace.tell
+    report = Pace.report
 
     def slowly(*arguments: object) -> None:
-        tell(*arguments)  # type: ignore[arg-type]
+        report(*arguments)  # type: ignore[arg-type]
         time.sleep(seconds)
 
-    Pace.tell = slowly  # type: ignore[method-assign]
+    Pace.report = slowly  # type: ignore[method-assign]
 
 
 if __name__ == "__main__":

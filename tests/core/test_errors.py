@@ -7,7 +7,7 @@ import pytest
 from lcollision_core.bodies.poses import DamagedPosesError, OtherModelError
 from lcollision_core.errors import (
     CancelledError,
-    HeldElsewhereError,
+    FileLockedError,
     LabelStoreError,
     LCollisionError,
     MeshFileError,
@@ -60,7 +60,7 @@ SENTENCES = [
     ),
     (CancelledError("cancelled on request"), "cancelled on request"),
     (LabelStoreError("has no rows", where="store", got=0), "store has no rows, got 0"),
-    (HeldElsewhereError("is being written", "wait", where="m"), "m is being written; wait"),
+    (FileLockedError("is being written", "wait", where="m"), "m is being written; wait"),
     (DamagedPosesError("is not JSON", where="p.json"), "p.json is not JSON"),
     (
         UnwritablePoseError("cannot hold this pose", where="hero.glb"),
@@ -128,8 +128,8 @@ def test_an_error_says_the_reason_that_another_gives(reason: Exception, sentence
 
 def test_fields_are_copied_into_another_class_and_about_another_place() -> None:
     error = MeshFileError("is wrong", "repair it", where="a", expected=1, got=2)
-    assert vars(ModelFileError.like(error)) == vars(error)
-    assert str(ModelFileError.like(error, "b")) == "b is wrong, expected 1, got 2; repair it"
+    assert vars(ModelFileError.from_error(error)) == vars(error)
+    assert str(ModelFileError.from_error(error, "b")) == "b is wrong, expected 1, got 2; repair it"
 
 
 def test_a_file_of_a_later_format_is_refused_with_both_versions() -> None:

@@ -42,7 +42,7 @@ class JointsDialog(QDialog):
 
     Signals
     -------
-    chosen : `partners.Followed`, the motion's joint for each joint of the body
+    chosen : `partners.JointMap`, the motion's joint for each joint of the body
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class JointsDialog(QDialog):
         cards = []
         listed = [
             (joint, words)
-            for joint, words in zip(match.ours, match.called, strict=True)
+            for joint, words in zip(match.rig_joints, match.labels, strict=True)
             if words or match.followed[joint] or joint in match.unsure
         ]
         for title, is_unsure in (("To be checked", True), ("Recognised", False)):
@@ -99,7 +99,7 @@ class JointsDialog(QDialog):
         grid.addWidget(labelled(motion, "caption"), 0, 1)
         grid.addWidget(labelled(body, "caption"), 0, 3, 1, 2)
         for row, (joint, words) in enumerate(rows, 1):
-            choice = _Choice(self._match.theirs, self._match.followed[joint])
+            choice = _Choice(self._match.source_joints, self._match.followed[joint])
             choice.setAccessibleName(f"Joint of the motion for {words or joint}")
             self.choices[joint] = choice
             if joint in self._match.unsure:

@@ -499,7 +499,7 @@ class ExactCard(Card):
             sentences.append(with_capital(rules.left_out_in_words()))
         if left_out:
             if verdict.counted_only:
-                what, sentence = rules.in_short(), f"{rules.described()} are not counted"
+                what, sentence = rules.summary(), f"{rules.described()} are not counted"
             else:
                 what, sentence = excluded.described(), rules.sentence(excluded)
             sentences.append(f"Pairs not counted: {what}")

@@ -16,12 +16,12 @@ from lcollision_core.files.gltf.schema import (
     PARTS,
     GltfDocument,
     as_float,
-    element,
     extension_of,
+    require_element,
+    require_int,
     stored_parts,
-    whole,
 )
-from lcollision_core.files.names import numbered_where_equal
+from lcollision_core.files.names import make_unique
 from lcollision_core.files.scene.scene import Clip, Part, ScenePoses
 from lcollision_core.files.scene.transforms import (
     compose,
@@ -258,7 +258,7 @@ class _GltfClip:
         times_of_bytes: dict[bytes, FloatArray] = {}
         last = len(self.document.objects("accessors")) - 1
         for sampler, _ in self.driven.values():
-            index = whole(sampler.get("input"), f"the accessor of {what}", 0, last)
+            index = require_int(sampler.get("input"), f"the accessor of {what}", 0, last)
             if index not in times_of:
                 times = as_float(self.document.array(index, what, ("SCALAR",))[:, 0])
                 times_of[index] = times_of_bytes.setdefault(times.tobytes(), times)
@@ -397,7 +397,7 @@ def _target_counts(parts: Sequence[Part]) -> dict[int, int]:
 
 
 def _names(animations: Sequence[dict[str, Any]]) -> list[str]:
-    return numbered_where_equal(
+    return make_unique(
         str(animation.get("name") or f"animation {i}") for i, animation in enumerate(animations)
     )
 
@@ -422,13 +422,13 @@ def _driven(
         node, path = driven_property(channel)
         if node is None:
             continue  # An extension defines the target.
-        element(nodes, node, f"a node of {where}")
+        require_element(nodes, node, f"a node of {where}")
         if path not in (*PARTS, _WEIGHTS):
             continue  # An extension defines the property.
         width = n_targets.get(node, 0) if path == _WEIGHTS else len(PARTS[path])
         if width:
             samplers = animation.get("samplers")
-            sampler = element(samplers, channel.get("sampler"), f"a sampler of {where}")
+            sampler = require_element(samplers, channel.get("sampler"), f"a sampler of {where}")
             driven[node, path] = sampler, width
     return driven
 

@@ -14,10 +14,10 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.files.gltf.schema import (
     GltfDocument,
     as_float,
-    element,
     numbers,
+    require_element,
     require_finite,
-    whole,
+    require_int,
 )
 from lcollision_core.files.scene.appearance import (
     Appearance,
@@ -177,7 +177,7 @@ class GltfLooks:
         return replace(
             finish,
             material=replace(finish.material, texture=self._texture(laid.get("index"))),
-            uv_set=whole(uv_set, "its set of texture coordinates", 0, _MOST_UV_SETS),
+            uv_set=require_int(uv_set, "its set of texture coordinates", 0, _MOST_UV_SETS),
             # Counter-clockwise, as v points down.
             turned=np.array([[cosine, sine], [-sine, cosine]]) * scale,
             offset=numbers(moved.get("offset", [0.0, 0.0]), "its texture's offset", 2),
@@ -185,7 +185,7 @@ class GltfLooks:
 
     def _texture(self, index: Any) -> Texture:
         document = self._document
-        texture = element(document.objects("textures"), index, "a texture")
+        texture = require_element(document.objects("textures"), index, "a texture")
         if index in self._textures:
             return self._textures[index]
         source: Any = texture.get("source")
@@ -193,13 +193,13 @@ class GltfLooks:
         if source is None:
             # The image may be in a format that an extension adds.
             source = next((_inner(others, name).get("source") for name in others), None)
-        image = element(document.objects("images"), source, "an image")
+        image = require_element(document.objects("images"), source, "an image")
         if source not in self._pixels:
             what = f"image {source}"
             self._pixels[source] = self._images.read(document.image(image, what), what)
         sampler: dict[str, Any] = {}
         if "sampler" in texture:
-            sampler = element(document.objects("samplers"), texture["sampler"], "a sampler")
+            sampler = require_element(document.objects("samplers"), texture["sampler"], "a sampler")
         u, v = (_WRAPS.get(_code(sampler, key), Wrap.REPEAT) for key in ("wrapS", "wrapT"))
         self._textures[index] = Texture(
             self._pixels[source],

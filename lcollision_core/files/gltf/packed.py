@@ -13,10 +13,10 @@ from lcollision_core.files.gltf.schema import (
     MESHOPT,
     GltfDocument,
     component_dtype,
-    element,
     extension_of,
     inner,
-    whole,
+    require_element,
+    require_int,
 )
 from lcollision_core.files.mesh.polygons import MAX_FACES, MAX_FILE_BYTES
 
@@ -49,9 +49,9 @@ def unpack(document: GltfDocument) -> None:
 
 
 def _meshopt(document: GltfDocument, held: dict[str, Any], what: str) -> bytes:
-    count = whole(held.get("count"), f"the count of {what}", 0, 3 * MAX_FACES)
+    count = require_int(held.get("count"), f"the count of {what}", 0, 3 * MAX_FACES)
     most = min(_MOST_STRIDE, MAX_FILE_BYTES // max(count, 1))
-    stride = whole(held.get("byteStride"), f"the stride of {what}", 1, most)
+    stride = require_int(held.get("byteStride"), f"the stride of {what}", 1, most)
     data = document.bytes_of(held, what)
     return decode(data, count, stride, str(held.get("mode")), str(held.get("filter", "NONE")))
 
@@ -60,7 +60,9 @@ def _has_data(document: GltfDocument, primitive: dict[str, Any]) -> bool:
     """Whether the accessors of a primitive's attributes point to data."""
     accessors = document.objects("accessors")
     return all(
-        not {"bufferView", "sparse"}.isdisjoint(element(accessors, index, f"an accessor ({name})"))
+        not {"bufferView", "sparse"}.isdisjoint(
+            require_element(accessors, index, f"an accessor ({name})")
+        )
         for name, index in primitive["attributes"].items()
     )
 
@@ -82,7 +84,9 @@ def _draco(
             where=document.path,
         ) from error
     views, accessors = document.objects("bufferViews"), document.objects("accessors")
-    number = whole(held.get("bufferView"), f"the compressed data of {where}", 0, len(views) - 1)
+    number = require_int(
+        held.get("bufferView"), f"the compressed data of {where}", 0, len(views) - 1
+    )
     if number not in unpacked:
         try:
             unpacked[number] = DracoPy.decode(document.bytes_of(views[number], where))
@@ -98,7 +102,7 @@ def _draco(
         values = decoded_attributes.get(name)
         if index is None or values is None:
             continue
-        accessor = element(accessors, index, f"an accessor ({name})")
+        accessor = require_element(accessors, index, f"an accessor ({name})")
         dtype = component_dtype(accessor.get("componentType"), f"an accessor ({name})")
         data = np.ascontiguousarray(values, dtype=dtype).tobytes()
         views.append({"buffer": document.add_unpacked(data), "byteLength": len(data)})

@@ -18,16 +18,16 @@ from lcollision_core.files.gltf.schema import (
     COMPRESSIONS,
     GltfDocument,
     as_float,
-    element,
     extension_of,
     inner,
     local_transform,
     numbers,
+    require_element,
     require_finite,
-    whole,
+    require_int,
 )
 from lcollision_core.files.mesh.polygons import MAX_FACES, require_plausible_count
-from lcollision_core.files.names import numbered_where_equal
+from lcollision_core.files.names import make_unique
 from lcollision_core.files.scene.scene import (
     NO_MESH,
     NoMeshError,
@@ -348,7 +348,7 @@ def _shown_primitives(
     left_out, notes = left_out_nodes(document, parents)
     visible = _visible(document, parents) - left_out
     showing = [
-        (whole(node["mesh"], f"the mesh of node {i}", 0, len(meshes) - 1), i)
+        (require_int(node["mesh"], f"the mesh of node {i}", 0, len(meshes) - 1), i)
         for i, node in enumerate(document.objects("nodes"))
         if "mesh" in node and i in visible
     ]
@@ -363,8 +363,10 @@ def _shown_primitives(
             if is_of_triangles and "POSITION" in primitive.get("attributes", {}):
                 what = f"positions of mesh {mesh}"
                 index = primitive["attributes"]["POSITION"]
-                accessor = element(document.objects("accessors"), index, f"the accessor of {what}")
-                count = whole(accessor.get("count"), f"the count of {what}", 0, MAX_FACES)
+                accessor = require_element(
+                    document.objects("accessors"), index, f"the accessor of {what}"
+                )
+                count = require_int(accessor.get("count"), f"the count of {what}", 0, MAX_FACES)
             if not count * n_instances:
                 n_others += 1
                 continue
@@ -381,7 +383,7 @@ def _parents(nodes: list[dict[str, Any]]) -> npt.NDArray[np.int64]:
     parents = np.full(len(nodes), -1, dtype=np.int64)
     for number, node in enumerate(nodes):
         for child in node.get("children", ()):
-            index = whole(child, f"a child of node {number}", 0, len(nodes) - 1)
+            index = require_int(child, f"a child of node {number}", 0, len(nodes) - 1)
             if parents[index] >= 0:
                 raise MeshFileError(
                     f"is damaged: node {index} (from 0) has two parents", where="it"
@@ -395,9 +397,9 @@ def _visible(document: GltfDocument, parents: npt.NDArray[np.int64]) -> set[int]
     scenes = document.objects("scenes")
     if not scenes:
         return set(range(len(parents)))
-    scene = element(scenes, document.description.get("scene", 0), "the scene")
+    scene = require_element(scenes, document.description.get("scene", 0), "the scene")
     last = len(parents) - 1
-    roots = {whole(node, "a node of the scene", 0, last) for node in scene.get("nodes", ())}
+    roots = {require_int(node, "a node of the scene", 0, last) for node in scene.get("nodes", ())}
     visible: set[int] = set()
     for node in parents_first(parents):
         if node in roots or parents[node] in visible:
@@ -441,7 +443,7 @@ def _part(document: GltfDocument, shown: Primitive, rest: FloatArray, looks: Glt
     materials: tuple[str, ...] = ()
     if "material" in primitive:
         number = primitive["material"]
-        named = element(document.objects("materials"), number, "a material")
+        named = require_element(document.objects("materials"), number, "a material")
         materials = (str(named.get("name") or f"material {number}"),)
     return Part(
         str(node.get("name") or mesh.get("name") or where),
@@ -502,10 +504,10 @@ def _faces(
 
 
 def _skin(document: GltfDocument, index: object) -> tuple[npt.NDArray[np.int64], FloatArray]:
-    skin = element(document.objects("skins"), index, "the skin")
+    skin = require_element(document.objects("skins"), index, "the skin")
     last = len(document.objects("nodes")) - 1
     what = f"a joint of skin {index}"
-    joints = [whole(joint, what, 0, last) for joint in skin.get("joints", ())]
+    joints = [require_int(joint, what, 0, last) for joint in skin.get("joints", ())]
     if not joints:
         raise MeshFileError("has no joints", where=f"skin {index}")
     bones = np.array(joints, dtype=np.int64)
@@ -588,7 +590,7 @@ def _sliders(document: GltfDocument, shown: Primitive, n: int) -> dict[str, Floa
         for target in range(n)
     ]
     expressions = _expressions(document, shown, n)
-    alone = dict(zip(numbered_where_equal(names), np.eye(n), strict=True))
+    alone = dict(zip(make_unique(names), np.eye(n), strict=True))
     return expressions | {name: own for name, own in alone.items() if name not in expressions}
 
 

@@ -134,8 +134,10 @@ class GltfDocument:
         views = description.get("bufferViews", [])
         for number, view in enumerate(views):
             what = f"of buffer view {number}"
-            start = starts[whole(view.get("buffer"), f"the buffer {what}", 0, len(starts) - 1)]
-            offset = whole(view.get("byteOffset", 0), f"the offset {what}", 0, MAX_FILE_BYTES)
+            start = starts[
+                require_int(view.get("buffer"), f"the buffer {what}", 0, len(starts) - 1)
+            ]
+            offset = require_int(view.get("byteOffset", 0), f"the offset {what}", 0, MAX_FILE_BYTES)
             views[number] = {**view, "buffer": 0, "byteOffset": start + offset}
         if starts:
             first = {**description["buffers"][0]}
@@ -205,11 +207,11 @@ class GltfDocument:
         ------
         MeshFileError : a number of the description is wrong, or points outside the data.
         """
-        accessor = element(self.objects("accessors"), index, f"accessor of {what}")
+        accessor = require_element(self.objects("accessors"), index, f"accessor of {what}")
         kind: Any = accessor.get("type")
         if kind not in types:
             raise MeshFileError.must_be(what, " or ".join(types), quoted(kind))
-        n = whole(accessor.get("count"), f"the count of {what}", 0, MAX_FACES * 3)
+        n = require_int(accessor.get("count"), f"the count of {what}", 0, MAX_FACES * 3)
         if count is not None and n != count:
             raise MeshFileError(f"have {n} values, {count} are needed", where=what)
         dtype = component_dtype(accessor.get("componentType"), what)
@@ -233,7 +235,7 @@ class GltfDocument:
         self, values: npt.NDArray[Any], sparse: dict[str, Any], what: str
     ) -> npt.NDArray[Any]:
         """Insert the sparse values of an accessor."""
-        n = whole(sparse.get("count"), f"the sparse count of {what}", 0, len(values))
+        n = require_int(sparse.get("count"), f"the sparse count of {what}", 0, len(values))
         if not sparse.keys() >= {"indices", "values"}:
             raise MeshFileError("lack their sparse indices or values", where=what)
         dtype = component_dtype(sparse["indices"].get("componentType"), what)
@@ -247,16 +249,16 @@ class GltfDocument:
         self, stored: dict[str, Any], what: str, n: int, width: int, dtype: np.dtype[Any]
     ) -> npt.NDArray[Any]:
         """Return (n, width) numbers of the buffer view of an object, without copying."""
-        view = element(
+        view = require_element(
             self.objects("bufferViews"), stored.get("bufferView"), f"buffer view of {what}"
         )
         buffer = self.buffer(view.get("buffer"), what)
-        start = whole(view.get("byteOffset", 0), f"the offset of {what}", 0, len(buffer))
+        start = require_int(view.get("byteOffset", 0), f"the offset of {what}", 0, len(buffer))
         most = len(buffer) - start
-        length = whole(view.get("byteLength"), f"the length of {what}", 0, most)
-        inside = whole(stored.get("byteOffset", 0), f"the offset of {what}", 0, length)
+        length = require_int(view.get("byteLength"), f"the length of {what}", 0, most)
+        inside = require_int(stored.get("byteOffset", 0), f"the offset of {what}", 0, length)
         size = width * dtype.itemsize
-        stride = whole(view.get("byteStride", size), f"the stride of {what}", size, 1 << 16)
+        stride = require_int(view.get("byteStride", size), f"the stride of {what}", size, 1 << 16)
         needed = (n - 1) * stride + size if n else 0
         if inside + needed > length:
             raise MeshFileError(
@@ -268,7 +270,7 @@ class GltfDocument:
 
     def has_buffer(self, index: object) -> bool:
         """Whether a buffer has bytes; one without stands for compressed data."""
-        buffer = element(self.objects("buffers"), index, "the buffer")
+        buffer = require_element(self.objects("buffers"), index, "the buffer")
         return "uri" in buffer or index in self._buffers or (index == 0 and self._blob is not None)
 
     def add_unpacked(self, data: bytes) -> int:
@@ -291,7 +293,7 @@ class GltfDocument:
         MeshFileError : it is missing, too large, or not beside this file.
         """
         buffers = self.objects("buffers")
-        number = whole(index, f"the buffer of {what}", 0, len(buffers) - 1)
+        number = require_int(index, f"the buffer of {what}", 0, len(buffers) - 1)
         if number not in self._buffers:
             buffer = buffers[number]
             if "uri" in buffer:
@@ -306,9 +308,9 @@ class GltfDocument:
     def bytes_of(self, stored: dict[str, Any], what: str) -> bytes:
         """Return the bytes of an object with the fields of a buffer view; raises as `buffer`."""
         buffer = self.buffer(stored.get("buffer"), what)
-        start = whole(stored.get("byteOffset", 0), f"the offset of {what}", 0, len(buffer))
+        start = require_int(stored.get("byteOffset", 0), f"the offset of {what}", 0, len(buffer))
         most = len(buffer) - start
-        length = whole(stored.get("byteLength"), f"the length of {what}", 0, most)
+        length = require_int(stored.get("byteLength"), f"the length of {what}", 0, most)
         return bytes(buffer[start : start + length])
 
     def image(self, described: dict[str, Any], what: str) -> bytes:
@@ -326,8 +328,8 @@ class GltfDocument:
         if "uri" in described:
             return resource(described["uri"], self.path, MAX_FILE_BYTES, what)
         views, index = self.objects("bufferViews"), described.get("bufferView")
-        view = element(views, index, f"for {what} the buffer view")
-        length = whole(view.get("byteLength"), f"the length of {what}", 0, MAX_FILE_BYTES)
+        view = require_element(views, index, f"for {what} the buffer view")
+        length = require_int(view.get("byteLength"), f"the length of {what}", 0, MAX_FILE_BYTES)
         return self._view(described, what, length, 1, np.dtype("u1")).tobytes()
 
     def _embed(self, image: dict[str, Any]) -> None:
@@ -452,7 +454,7 @@ def as_float(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
         return values.astype(np.float64)
 
 
-def element(items: Sequence[T] | None, index: object, what: str) -> T:
+def require_element(items: Sequence[T] | None, index: object, what: str) -> T:
     """Return an element of a list of the file, or raise `MeshFileError` if it does not exist."""
     n = len(items or ())
     if items is None or type(index) is not int or not 0 <= index < n:
@@ -460,7 +462,7 @@ def element(items: Sequence[T] | None, index: object, what: str) -> T:
     return items[index]
 
 
-def whole(value: object, what: str, low: int, high: int) -> int:
+def require_int(value: object, what: str, low: int, high: int) -> int:
     """Return an integer of the file, or raise `MeshFileError` if it is out of range."""
     if type(value) is not int or not low <= value <= high:
         raise MeshFileError.must_be(what, f"a whole number from {low} to {high}", quoted(value))
@@ -611,7 +613,7 @@ def _require_complete(document: GltfDocument) -> None:
             if not all(name in item for item in holder.get(path, ())):
                 raise MeshFileError(f"has {path} without {name}", where=f"{one} {number}")
     last = max(len(document.objects("scenes")) - 1, 0)
-    whole(document.description.get("scene", 0), "the scene", 0, last)
+    require_int(document.description.get("scene", 0), "the scene", 0, last)
 
 
 def _without_compression(description: dict[str, Any]) -> None:

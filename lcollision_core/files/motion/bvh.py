@@ -76,7 +76,7 @@ class Bvh:
         """(T,) times in seconds, from 0."""
         return np.arange(len(self), dtype=np.float64) * self.frame_time
 
-    def turns(self) -> FloatArray:
+    def rotations(self) -> FloatArray:
         """Return the (T, J, 3, 3) rotations of the joints relative to their parents."""
         turned = np.broadcast_to(np.eye(3), (len(self), len(self.names), 3, 3)).copy()
         for joint, (columns, axes) in enumerate(self._columns(_AXES)):
@@ -87,7 +87,7 @@ class Bvh:
                 turned[:, joint] = Rotation.from_euler(axes, given).as_matrix()
         return turned
 
-    def places(self) -> FloatArray:
+    def positions(self) -> FloatArray:
         """Return the (T, J, 3) positions of joints relative to parents; a root's is global."""
         placed = np.broadcast_to(self.offsets, (len(self), *self.offsets.shape)).copy()
         for joint, (columns, axes) in enumerate(self._columns(_PLACES)):
@@ -101,7 +101,7 @@ class Bvh:
         Parameters
         ----------
         frames : n frame numbers, ascending
-        turns : (n, J, 3, 3), see `turns`
+        turns : (n, J, 3, 3), see `rotations`
         roots : (n, 3) positions of the root
         """
         numbers = self.numbers[list(frames)]

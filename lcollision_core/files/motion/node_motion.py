@@ -56,11 +56,11 @@ class NodeMotion:
         """Return T, the number of frames."""
         return len(self.times)
 
-    def turns(self) -> FloatArray:
+    def rotations(self) -> FloatArray:
         """Return the (T, J, 3, 3) rotations of the joints from rest, relative to their parents."""
         return self._turns.copy()
 
-    def places(self) -> FloatArray:
+    def positions(self) -> FloatArray:
         """Return the (T, J, 3) positions of joints relative to parents; a root's is global."""
         return self._places.copy()
 

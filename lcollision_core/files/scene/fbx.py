@@ -28,7 +28,7 @@ from lcollision_core.files.mesh.polygons import (
     require_plausible_count,
     triangulate,
 )
-from lcollision_core.files.names import numbered_where_equal
+from lcollision_core.files.names import make_unique
 from lcollision_core.files.safe import read_regular
 from lcollision_core.files.scene.appearance import Appearance, ImageReader, Material, Texture, Wrap
 from lcollision_core.files.scene.scene import (
@@ -50,7 +50,7 @@ IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Laid:
+class MeshFaces:
     """The faces of a mesh, to which an appearance is applied.
 
     Attributes
@@ -132,7 +132,7 @@ class FbxLooks:
                     raise MeshFileError.unreadable(f"the texture {quoted(name)}", error) from error
         raise MeshFileError("is not beside the file", where=f"the texture {quoted(name)}")
 
-    def appearance(self, laid: Laid, *, shaded: bool = False) -> Appearance:
+    def appearance(self, laid: MeshFaces, *, shaded: bool = False) -> Appearance:
         """Read the appearance of a mesh; if `shaded`, with normals, which split points too."""
         looks, (materials, notes) = self._found, self._materials
         faces = laid.faces_of_corners()
@@ -206,8 +206,8 @@ def read_shown(source: FbxDocument) -> Scene:
     MissingExtraError : the extra `fbx` is not installed.
     MeshFileError : the file is damaged or too large, or shows no faces.
     """
-    answer = source.asked()
-    looks = FbxLooks(partial(source.asked, looks=True), source.path)
+    answer = source.request()
+    looks = FbxLooks(partial(source.request, looks=True), source.path)
     unseen = answer["unseen"].tolist()
     why = "left out, as its file hides it or shows a finer level of detail"
     notes = [left_out_note(why, unseen)] if unseen else []
@@ -248,7 +248,7 @@ def read_nodes(source: FbxDocument) -> Scene:
     MissingExtraError : the extra `fbx` is not installed.
     MeshFileError : the file is damaged or too large.
     """
-    answer = source.asked()
+    answer = source.request()
     skins = [
         (own["bones"][1:], own["bind"][1:])
         for own in (_only(answer, number) for number in range(len(answer["shown"])))
@@ -294,7 +294,7 @@ class FbxDocument:
         """Whether it has clusters of a skin; names of objects are never compressed."""
         return b"Cluster" in self.data
 
-    def asked(
+    def request(
         self, clip: int | None = None, times: FloatArray | None = None, looks: bool = False
     ) -> dict[str, Any]:
         """Return the arrays of `fbx_worker` for a request."""
@@ -361,13 +361,13 @@ class _FbxClip:
 
     def __call__(self, times: FloatArray) -> ScenePoses:
         """Return the poses at (N,) times."""
-        answer = self.source.asked(self.clip, times)
+        answer = self.source.request(self.clip, times)
         weights = tuple(answer[f"{number} weights"] for number in self.parts)
         return ScenePoses(answer["transforms"], weights)
 
 
 def _clips(source: FbxDocument, held: dict[str, Any], parts: tuple[int, ...]) -> list[Clip]:
-    names = numbered_where_equal([name or "clip" for name in held["clips"].tolist()])
+    names = make_unique([name or "clip" for name in held["clips"].tolist()])
     clips = []
     for number, (name, (start, end)) in enumerate(zip(names, held["spans"], strict=True)):
         key_times = _frame_times(name, float(start), float(end), float(held["fps"]))
@@ -440,7 +440,7 @@ def _part(
     if is_mirrored(transforms[bones] @ bind, bone_of, weights):
         faces = faces[:, [0, 2, 1]]
     material_of = material_of[is_face][cut_of]
-    laid = Laid(number, is_used, corners, sizes[is_face], faces, cut_of, material_of)
+    laid = MeshFaces(number, is_used, corners, sizes[is_face], faces, cut_of, material_of)
     return Part(
         str(held["name"]),
         tuple(held["materials"].tolist()),
@@ -485,7 +485,7 @@ def _influences(held: dict[str, Any], n_vertices: int) -> tuple[npt.NDArray[np.i
 def _sliders(held: dict[str, Any]) -> dict[str, FloatArray]:
     """Return `Part.sliders`, one for each blend shape."""
     names = [name or f"shape {n}" for n, name in enumerate(held["shapes"].tolist(), 1)]
-    return dict(zip(numbered_where_equal(names), np.eye(len(names)), strict=True))
+    return dict(zip(make_unique(names), np.eye(len(names)), strict=True))
 
 
 def _morphs(held: dict[str, Any], n_vertices: int) -> npt.NDArray[np.float32]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from .client import Engine, EngineError, Request, Told
+from .client import Engine, EngineError, ProgressCallback, Request
 from .results import Shown
 from .scene import Rigged, SceneError
 
@@ -39,7 +39,9 @@ class OpenCharacter:
     n_vertices: dict[str, int]
     answer: dict
 
-    def send(self, kind: str, progress: Told | None = None, **values: object) -> Request:
+    def send(
+        self, kind: str, progress: ProgressCallback | None = None, **values: object
+    ) -> Request:
         """Send a request about the character without waiting: see `Engine.send`."""
         return self.engine.send(kind, progress, character=self.answer["character"], **values)
 

@@ -136,10 +136,10 @@ def test_info_says_how_far_a_model_is_that_is_being_learned(
 ) -> None:
     work = WorkFolder(tmp_path / "hero.safetensors")
     work.path.mkdir()
-    work.tell(
+    work.write_status(
         LearningStatus(RunState.RUNNING, Stage.LABELS, 0.5, 0.62, seconds_left=120.0, facts=())
     )
-    with work.held():
+    with work.lock():
         result = lcollision("info", tmp_path / "hero.safetensors")
         assert result.exit_code == 0, result.output
         assert result.stdout == (

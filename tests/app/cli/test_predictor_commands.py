@@ -23,7 +23,7 @@ from PIL import Image
 from app.benchmarks import predictor as timing
 from app.cli.models import measured_model_sentence
 from lcollision_core import predictor as predictors
-from lcollision_core.bodies import LearnedBody, PoseKind, find_model, judging, learned_body
+from lcollision_core.bodies import LearnedBody, PoseKind, find_model, learned_body, scoring
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.labels import LabelStore, is_held_out
 from lcollision_core.model_file import Section
@@ -40,7 +40,7 @@ SECONDS_TO_WAIT = 600.0
 @pytest.fixture(autouse=True)
 def _few_poses_on_the_card(monkeypatch: pytest.MonkeyPatch) -> None:
     """Judge a trained predictor on 40 poses of each kind instead of 500."""
-    monkeypatch.setattr(judging, "CARD_POSES", 40)
+    monkeypatch.setattr(scoring, "CARD_POSES", 40)
 
 
 @pytest.fixture(scope="module")

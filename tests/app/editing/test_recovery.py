@@ -28,7 +28,7 @@ from lcollision_core.bodies import (
 )
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.motion import Motion
-from lcollision_core.tasks.scenes import beside_each_other, kept_scene
+from lcollision_core.tasks.scenes import kept_scene, scene_of_files
 from tests.core.motion.swings import CLIP, OTHER
 
 EDITOR = """
@@ -466,7 +466,7 @@ def test_edits_of_several_clips_are_recovered_with_what_was_exported(
 def test_the_motion_of_a_scene_is_recovered_though_another_body_is_open_since(
     qtbot: QtBot, document: PoseDocument, swing: Path, tmp_path: Path
 ) -> None:
-    path = kept_scene(beside_each_other([swing, swing]))
+    path = kept_scene(scene_of_files([swing, swing]))
     timeline = opened(qtbot, document, path)
     edited = edited_by_hand(document, 20, 0.3)
     assert Autosave(document, tmp_path / "sessions", seconds=1000.0).close(keep=True)

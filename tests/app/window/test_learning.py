@@ -171,7 +171,7 @@ def test_a_run_goes_on_without_its_window_and_the_next_window_finds_it(
     work = WorkFolder.at(path)
     qtbot.waitUntil(lambda: work.status.stage == "latent space", timeout=PATIENCE)
     close_window(watching)
-    assert work.is_held
+    assert work.is_locked
     document = PoseDocument(editor_model, library_folder=tmp_path / "library")
     later = open_window(qtbot, document, settings_in(tmp_path))
     qtbot.waitUntil(lambda: len(later.learning.runs.runs) == 1, timeout=PATIENCE)
@@ -274,7 +274,9 @@ def test_several_runs_are_looked_at_and_one_is_discarded(watching: MainWindow) -
     for name, state in (("hero", RunState.RUNNING), ("villain", RunState.FAILED)):
         work = WorkFolder(model_destination(name))
         work.prepare(LearningRequest(("/nowhere.npz",)))
-        work.tell(LearningStatus(state, "labels", 0.4, 0.43, 480.0, sentence="the file is gone"))
+        work.write_status(
+            LearningStatus(state, "labels", 0.4, 0.43, 480.0, sentence="the file is gone")
+        )
         folders.append(work)
     hero, villain = folders
     with locked(hero.path / "run"):
@@ -310,7 +312,7 @@ def test_a_run_that_nearly_always_collides_offers_the_character_instead(
     work.prepare(LearningRequest((str(file),)))
     sentence = "97 % of the first 1024 samples collide"
     status = LearningStatus(RunState.FAILED, "latent space", 1.0, 0.2, sentence=sentence)
-    work.tell(replace(status, model=str(file), mostly_collides=True))
+    work.write_status(replace(status, model=str(file), mostly_collides=True))
     window.learning.runs.poll()
     window.actions_by_key["learning"].trigger()
     dialog = dialog_of(window)
@@ -322,7 +324,7 @@ def test_a_run_that_nearly_always_collides_offers_the_character_instead(
     qtbot.waitUntil(lambda: isinstance(window.document.model, RigBody), timeout=PATIENCE)
     # The finished part is kept until it is discarded.
     assert work.path.exists()
-    work.tell(replace(status, sentence="the disk is full"))
+    work.write_status(replace(status, sentence="the disk is full"))
     window.learning.runs.poll()
     assert dialog.resume.text().replace("&", "") == "Continue"
     assert not dialog.open_model.isVisible()
@@ -334,7 +336,7 @@ def finished(name: str, model: LearnedBody) -> WorkFolder:
     work = WorkFolder(model_destination(name))
     work.prepare(LearningRequest(("/nowhere.npz",)))
     model.save(work.destination)
-    work.tell(LearningStatus(RunState.DONE, done=1.0, model=str(work.destination)))
+    work.write_status(LearningStatus(RunState.DONE, done=1.0, model=str(work.destination)))
     return work
 
 
@@ -445,7 +447,7 @@ def test_the_dialog_keeps_its_size_and_does_not_come_back_once_closed(
     work.prepare(LearningRequest(("/nowhere.npz",)))
 
     def tell(stage: str, done: float) -> None:
-        work.tell(LearningStatus(RunState.RUNNING, stage, done, done, 480.0))
+        work.write_status(LearningStatus(RunState.RUNNING, stage, done, done, 480.0))
         runs.poll()
 
     with locked(work.path / "run"):

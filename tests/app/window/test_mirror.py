@@ -64,7 +64,7 @@ def test_mirroring_twice_is_the_pose_again_also_after_save_and_reopen(
     assert document.history.undo_stack.undoText() == "Mirror"
     symmetry = body.symmetry
     assert symmetry is not None
-    distance = np.linalg.norm(shown(window) - symmetry.image(before), axis=1)
+    distance = np.linalg.norm(shown(window) - symmetry.mirror_vertices(before), axis=1)
     assert distance.mean() / body.body_size < 0.008
     take_picture(window, "mirror_after")
 

@@ -232,13 +232,13 @@ def test_a_state_that_is_not_known_is_one_of_a_run_that_is_stopped(runs: Learnin
         status.write_text(status.read_text().replace("running", state))
         runs.poll()
         assert [run.state for run in runs.runs] == [RunState.STOPPED]
-        work.tell(LearningStatus(RunState.RUNNING))
+        work.write_status(LearningStatus(RunState.RUNNING))
 
 
 def folder_of(name: str, state: RunState) -> WorkFolder:
     work = WorkFolder(model_destination(name))
     work.prepare(LearningRequest(("/nowhere.npz",)))
-    work.tell(LearningStatus(state, "labels", 0.5, 0.6, 100.0))
+    work.write_status(LearningStatus(state, "labels", 0.5, 0.6, 100.0))
     return work
 
 

@@ -96,7 +96,7 @@ def test_left_and_right_are_alike(body: RigBody) -> None:
     symmetry = body.symmetry
     assert symmetry is not None
     mean, spread = vertices.mean(axis=0), vertices.std(axis=0)
-    np.testing.assert_allclose(symmetry.image(mean), mean, atol=0.02 * SCALE)
+    np.testing.assert_allclose(symmetry.mirror_vertices(mean), mean, atol=0.02 * SCALE)
     np.testing.assert_allclose(spread[symmetry.partner], spread, atol=0.02 * SCALE)
     # An arm can be lowered as far as a person's, whatever its axes.
     limits = HumanDraws(body.space).limits

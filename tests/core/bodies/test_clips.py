@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import body_of_motion, motion_of_transforms, read_motions
-from lcollision_core.bodies.partners import following, remember_followed
+from lcollision_core.bodies.partners import remember_followed, with_joint_map
 from lcollision_core.bodies.retargeting import joint_match
 from lcollision_core.errors import MeshFileError, ModelFileError
 from lcollision_core.files import Character, read_character
@@ -195,7 +195,7 @@ def test_joints_follow_as_a_file_says(
     assert match is not None
     assert match.followed["LeftArm"] == "LeftArm"
     file.write_text('{"joints": {"LeftArm": "RightArm", "LeftForeArm": null}}')
-    other = following(body, file)
+    other = with_joint_map(body, file)
     changed_match = joint_match(other, path)
     assert changed_match is not None
     expected = {**match.followed, "LeftArm": "RightArm", "LeftForeArm": None}
@@ -207,10 +207,10 @@ def test_joints_follow_as_a_file_says(
         np.testing.assert_array_equal(own.codes, theirs.codes)
     file.write_text('{"joints": {"LeftArm": "Tail"}}')
     with pytest.raises(MeshFileError, match="the motion has no joint 'Tail'; its joints are"):
-        read_motions(following(body, file), path)
+        read_motions(with_joint_map(body, file), path)
     file.write_text('{"joints": 3}')
     with pytest.raises(ModelFileError, match="joints"):
-        following(body, file)
+        with_joint_map(body, file)
 
 
 def test_a_clip_is_checked_and_resolved_into_the_characters_own_file(

@@ -21,7 +21,7 @@ from lcollision_core.bodies import (
     remember_up,
     write_poses,
 )
-from lcollision_core.bodies.known import find_character, user_characters_folder
+from lcollision_core.bodies.remembered import find_character, user_characters_folder
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.files import Mesh
 from lcollision_core.files.scene_files import open_rigged

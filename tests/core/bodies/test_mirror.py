@@ -105,11 +105,11 @@ def test_the_image_of_a_placed_mesh_is_the_placed_image(axis: int) -> None:
     symmetry = Symmetry(np.array([1, 0, 2, 3, 4, 5], np.int32), np.eye(3)[axis], 0.7)
     placement = RigidTransform(random_rotation(rng), rng.normal(size=3))
     mesh = rng.normal(size=(6, 3))
-    image = symmetry.image(placement.apply(mesh))
+    image = symmetry.mirror_vertices(placement.apply(mesh))
     mirrored = symmetry.image_of_placement(placement)
-    np.testing.assert_allclose(mirrored.apply(symmetry.image(mesh)), image, atol=1e-12)
+    np.testing.assert_allclose(mirrored.apply(symmetry.mirror_vertices(mesh)), image, atol=1e-12)
     assert np.linalg.det(mirrored.rotation) == pytest.approx(1.0)
-    np.testing.assert_allclose(symmetry.image(image), placement.apply(mesh), atol=1e-12)
+    np.testing.assert_allclose(symmetry.mirror_vertices(image), placement.apply(mesh), atol=1e-12)
 
 
 def test_a_mirror_image_lies_where_the_mirror_shows_it(
@@ -120,7 +120,7 @@ def test_a_mirror_image_lies_where_the_mirror_shows_it(
     assert symmetry is not None
     for latent in samples[[0, 2, 3]]:
         mirrored = body.mirror(latent)
-        image = symmetry.image(body.decode(latent))
+        image = symmetry.mirror_vertices(body.decode(latent))
         distance = np.linalg.norm(body.decode(mirrored.latent) - image, axis=1) / body.body_size
         assert mirrored.placement is None
         assert distance.mean() == pytest.approx(mirrored.fit_error_mean, rel=1e-6)
@@ -158,7 +158,7 @@ def test_mirroring_twice_gives_pose_and_place_back_to_the_bit(
     assert once.placement is not None
     symmetry = body.symmetry
     assert symmetry is not None
-    image = symmetry.image(placement.apply(body.decode(samples[0])))
+    image = symmetry.mirror_vertices(placement.apply(body.decode(samples[0])))
     placed = once.placement.apply(body.decode(once.latent))
     distance = np.linalg.norm(placed - image, axis=1) / body.body_size
     assert distance.mean() == pytest.approx(once.fit_error_mean, rel=1e-6)
@@ -185,7 +185,7 @@ def test_a_free_pose_that_collides_mirrored_is_resolved(
 ) -> None:
     assert resolved.pairs_before == 0 < resolved.pairs_mirrored
     assert resolved.pairs_after == 0
-    assert not resolved.lost_freedom
+    assert not resolved.collides_newly
     assert resolved.resolution is not None
     np.testing.assert_array_equal(resolved.latent, resolved.resolution.latent)
     vertices = body.exported_vertices(resolved.latent)
@@ -193,7 +193,7 @@ def test_a_free_pose_that_collides_mirrored_is_resolved(
     symmetry = body.symmetry
     assert symmetry is not None
     # The fit error is that of the returned, resolved pose.
-    image = symmetry.image(body.decode(resolved.source.latent))
+    image = symmetry.mirror_vertices(body.decode(resolved.source.latent))
     distance = np.linalg.norm(body.decode(resolved.latent) - image, axis=1) / body.body_size
     assert resolved.fit_error_mean == pytest.approx(distance.mean(), rel=1e-6)
     assert body.mirror(resolved.latent, None, resolved.source).restored
@@ -205,7 +205,7 @@ def test_locked_domains_keep_what_they_have_in_the_mirror(
     pose = samples[FREE_THAT_COLLIDES_MIRRORED]
     every = frozenset(range(len(body.domain_names)))
     stuck = body.mirror(pose, options=ResolveOptions(locked_domains=every))
-    assert stuck.lost_freedom
+    assert stuck.collides_newly
     assert stuck.pairs_after == stuck.pairs_mirrored == resolved.pairs_mirrored
     assert stuck.resolution is not None
     assert stuck.resolution.exactly_free is False
@@ -221,7 +221,7 @@ def test_without_a_predictor_a_lost_freedom_is_told(
 ) -> None:
     bare = LearnedBody(body.name, body.embedding, body.card)
     mirrored = bare.mirror(samples[FREE_THAT_COLLIDES_MIRRORED])
-    assert mirrored.lost_freedom
+    assert mirrored.collides_newly
     assert mirrored.resolution is None
     assert mirrored.pairs_after == resolved.pairs_mirrored
 
@@ -231,7 +231,7 @@ def test_a_colliding_pose_is_mirrored_as_it_is(body: LearnedBody, samples: np.nd
     assert mirrored.pairs_before > 0
     assert mirrored.pairs_after == mirrored.pairs_mirrored > 0
     assert mirrored.resolution is None
-    assert not mirrored.lost_freedom
+    assert not mirrored.collides_newly
 
 
 def test_a_model_without_two_sides_says_so(tube_model: LearnedBody) -> None:
@@ -314,7 +314,7 @@ def test_pins_are_mirrored_to_the_other_side(body: LearnedBody, samples: np.ndar
     )
     image = mirror_image(body, pose)
     assert {pin.frame[0][0] for pin in image.pins} == {int(symmetry.partner[7])}
-    reflected = symmetry.image(vertices)
+    reflected = symmetry.mirror_vertices(vertices)
     for pin, grip in zip(image.pins, grips, strict=True):
         partner = make_grip(body.space, pin.vertex, pin.radius)
         assert pin.vertex == symmetry.partner[grip.vertex] != grip.vertex
@@ -370,7 +370,7 @@ def test_a_part_on_the_other_side_becomes_like_the_mirror_image(body: LearnedBod
     assert changed.any()
     assert not changed[~body.embedding.codes_of([right])].any()
     inside = body.space.vertex_domain == right
-    image = mirror.symmetry.image(body.decode(pose))
+    image = mirror.symmetry.mirror_vertices(body.decode(pose))
     shapes = [vertices[inside] for vertices in (body.decode(pose), body.decode(after), image)]
     before, now, wanted = (shape - shape.mean(axis=0) for shape in shapes)
     assert np.linalg.norm(now - wanted) < 0.4 * np.linalg.norm(before - wanted)

@@ -395,7 +395,7 @@ def test_sampled_poses_are_of_the_kind_asked_for(model: LearnedBody, colliding: 
 def test_sampling_gives_up_in_a_sentence(
     model: LearnedBody, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lcollision_core.bodies.judging._MOST_MISSES", 128)
+    monkeypatch.setattr("lcollision_core.bodies.scoring._MOST_MISSES", 128)
     # Poses this near to the mean are all free.
     box = model.embedding.box
     calm = replace(model.embedding, box=LatentBox(0.01 * box.low, 0.01 * box.high))

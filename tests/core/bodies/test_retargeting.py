@@ -185,7 +185,7 @@ def test_a_file_of_any_encoding_and_line_ends_is_read_and_written_in_them(
     bvh = read_bvh(path)
     assert bvh.names[0].startswith("LOCOMOTION ")
     assert "MOTION_root" in bvh.names
-    turns, roots = bvh.turns()[[5]], bvh.places()[[5], 0]
+    turns, roots = bvh.rotations()[[5]], bvh.positions()[[5], 0]
     before, after = path.read_bytes(), bvh.with_frames([5], turns, roots)
     assert bvh.with_frames([], turns[:0], roots[:0]) == before
     lines = [data.decode(encoding, "replace").split("\n") for data in (before, after)]
@@ -291,7 +291,7 @@ def test_a_rig_without_one_root_leaves_the_skeleton_in_its_place(tmp_path: Path)
     after = before.copy()
     after[:, -1, :3, 3] += 0.1
     _, roots = retargeting.changed(range(2), before, after)
-    np.testing.assert_array_equal(roots, bvh.places()[:, 0])
+    np.testing.assert_array_equal(roots, bvh.positions()[:, 0])
 
 
 def test_a_skeleton_of_something_else_is_refused(tmp_path: Path) -> None:
@@ -348,8 +348,8 @@ def test_scale_channels_of_one_are_read_and_others_are_refused_by_name(tmp_path:
         rows = [" ".join([*row[:6], "1", f"{scale}", "1", *row[6:]]) for row in words]
         scaled.write_text(f"{head}Frame Time:{time}\n" + "\n".join(rows) + "\n")
         if scale == 1.0:
-            assert np.array_equal(read_bvh(scaled).turns(), plain.turns())
-            assert np.array_equal(read_bvh(scaled).places(), plain.places())
+            assert np.array_equal(read_bvh(scaled).rotations(), plain.rotations())
+            assert np.array_equal(read_bvh(scaled).positions(), plain.positions())
     with pytest.raises(MeshFileError, match="it scales the joint 'Hips'"):
         read_bvh(scaled)
 

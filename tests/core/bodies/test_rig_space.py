@@ -253,7 +253,7 @@ def test_the_root_goes_with_its_own_part_and_stays_while_others_are_dragged() ->
     )
     limbs = space.limbs
     for vertex in (of_hips, of_hand):
-        reaches = limbs.reaches(limbs.holding(np.array([vertex]), np.ones(1)))
+        reaches = limbs.drag_stages(limbs.held_segment(np.array([vertex]), np.ones(1)))
         moved = limbs.codes_of(set().union(*reaches))
         assert moved[whole].all() == (vertex == of_hips)
         assert moved[~whole].any() == (vertex == of_hand)
@@ -273,7 +273,7 @@ def test_a_root_that_leads_no_vertex_goes_with_what_does() -> None:
     assert space.part_names == ("one", "two", "three")
     assert set(space.joint_of_code[:6]) == {0}
     assert space.codes_of([0]).sum() == 6 + 3
-    first = space.limbs.holding(np.array([0]), np.ones(1))
+    first = space.limbs.held_segment(np.array([0]), np.ones(1))
     assert space.limbs.codes_of([first])[:6].all()
 
 

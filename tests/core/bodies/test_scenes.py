@@ -152,7 +152,7 @@ def test_the_only_body_that_is_posed_keeps_its_names_and_its_mirror(folder: Path
 
 
 def test_a_drag_moves_the_body_that_is_held_alone(two: SceneBody) -> None:
-    dragger, start = two.dragger(), two.apart(np.zeros(two.latent_size))[0]
+    dragger, start = two.dragger(), two.separated_poses(np.zeros(two.latent_size))[0]
     decoded = two.decode(start)
     hand = int(decoded[two.vertices_of["hero"], 0].argmin())
     dragger.begin(start, Grip.at(hand), options=DragOptions(whole_body=True))

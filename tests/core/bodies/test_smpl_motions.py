@@ -175,7 +175,7 @@ def test_components_of_hands_need_those_of_the_model(body: RigBody, tmp_path: Pa
     for flat, mean in ((None, True), (False, True), (True, False)):
         own = arrays | ({} if flat is None else {"flat_hand_mean": np.array(flat)})
         shaped, motion, _ = of_file(able, tmp_path / "motion.npz", own)
-        turned, _ = shaped.space.turns_of(motion.codes[1])
+        turned, _ = shaped.space.rotations_of(motion.codes[1])
         expected = shares[1] @ held["hands_componentsl"][:12] + mean * held["hands_meanl"]
         np.testing.assert_allclose(turned[left].ravel(), expected, atol=1e-12)
 
@@ -248,7 +248,7 @@ def test_components_come_back_as_near_as_they_go(tmp_path: Path) -> None:
     with np.load(out) as new:
         shares = new["right_hand_pose"]
     assert (shares[[0, 2]] == 0.0).all()
-    turned, _ = shaped.space.turns_of(changed(motion, [1]).after.codes[1])
+    turned, _ = shaped.space.rotations_of(changed(motion, [1]).after.codes[1])
     right = turned[NAMES.index("right_index1") :].ravel() - held["hands_meanr"]
     np.testing.assert_allclose(shares[1], held["hands_componentsr"][:6] @ right, atol=1e-9)
 

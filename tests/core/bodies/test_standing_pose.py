@@ -164,4 +164,6 @@ def test_another_rest_pose_shows_the_same_and_goes_back() -> None:
     for ours, theirs in zip(in_world(rested), in_world(stored), strict=True):
         if ours.ndim == 3:  # places
             np.testing.assert_allclose(ours, theirs, atol=1e-12)
-    np.testing.assert_allclose(rested.turns_as_stored(rested.turns()), stored.turns(), atol=1e-12)
+    np.testing.assert_allclose(
+        rested.turns_as_stored(rested.rotations()), stored.rotations(), atol=1e-12
+    )

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from lcollision_core import devices
 from lcollision_core.bodies import open_body
-from lcollision_core.bodies.judging import judge_poses
 from lcollision_core.bodies.motions import read_motions
+from lcollision_core.bodies.scoring import check_poses
 from lcollision_core.contact import STRICT, CollisionDetector, ContactRules, gpu_search
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.embedding.gpu_decoder import GpuDecoder
@@ -232,8 +232,8 @@ def test_codes_to_verdicts_stay_on_the_gpu(monkeypatch: pytest.MonkeyPatch) -> N
     frames = list(range(0, len(motion), len(motion) // 3))
     expected = motion.collide(frames, check)
     assert 0 < expected.sum() < len(frames)
-    assert np.array_equal(judge_poses(body, motion.codes[frames]).colliding, expected)
+    assert np.array_equal(check_poses(body, motion.codes[frames]).colliding, expected)
     choose_device(Device.CUDA)
     monkeypatch.setattr(type(body.space), "decode", None)
     assert np.array_equal(motion.collide(frames, check), expected)
-    assert np.array_equal(judge_poses(body, motion.codes[frames]).colliding, expected)
+    assert np.array_equal(check_poses(body, motion.codes[frames]).colliding, expected)

@@ -129,7 +129,7 @@ def test_what_is_left_out_takes_part_in_no_pair() -> None:
         assert found.excluded == RuleCounts(ignored=1)
         said = rules.sentence(found.excluded)
         assert said == f"without {name}, 1 pair of parts left out is not counted"
-        assert rules.sentence(RuleCounts()) == rules.in_short() == f"without {name}"
+        assert rules.sentence(RuleCounts()) == rules.summary() == f"without {name}"
     with pytest.raises(ShapeError, match="the group 'hilt' is unknown, expected 'floor', 'blade'"):
         check_by_the_text(CROSSING, CROSSING.vertices, ContactRules(left_out=("hilt",)), groups)
 

@@ -51,7 +51,7 @@ def test_poses_are_those_of_the_papers_equations(tmp_path: Path, n_joints: int) 
     np.savez(path, **arrays)
     space = RigPoseSpace(character_of_smpl(read_smpl(path), betas))
     turns, shifts = random_turns(n_joints)
-    codes = space.codes_of_turns(turns, shifts)
+    codes = space.codes_of_rotations(turns, shifts)
     found = space.decode(codes) * space.body_size
     pelvis = space.rig.rest[0, :3, 3]
     for own, pose, turned, shift in zip(found, codes, turns, shifts, strict=True):
@@ -59,7 +59,7 @@ def test_poses_are_those_of_the_papers_equations(tmp_path: Path, n_joints: int) 
         assert np.abs(own - expected).max() < SAME
         assert np.abs(space.skinned(space.transforms(pose)) * space.body_size - own).max() < SAME
         assert np.abs(space.transforms(pose)[0, :3, 3] - pelvis - shift).max() < SAME
-        back = space.turns_of(pose)
+        back = space.rotations_of(pose)
         np.testing.assert_allclose(back[0], turned, atol=1e-12)
         np.testing.assert_allclose(back[1], shift, atol=1e-12)
     # Pose blend shapes matter: without them the skin is off by millimetres.
@@ -68,13 +68,13 @@ def test_poses_are_those_of_the_papers_equations(tmp_path: Path, n_joints: int) 
 
 
 def test_some_vertices_are_to_the_bit_those_of_all(space: RigPoseSpace) -> None:
-    codes = space.codes_of_turns(*random_turns(space.n_joints, 2))
+    codes = space.codes_of_rotations(*random_turns(space.n_joints, 2))
     chosen = np.arange(5, space.topology.n_vertices, 11)
     np.testing.assert_array_equal(space.decode_some(codes, chosen), space.decode(codes)[:, chosen])
 
 
 def test_derivatives_are_those_of_differences(space: RigPoseSpace) -> None:
-    (codes,) = space.codes_of_turns(*random_turns(space.n_joints, 1))
+    (codes,) = space.codes_of_rotations(*random_turns(space.n_joints, 1))
     chosen = np.arange(3, space.topology.n_vertices, 10)
     step = 1e-6 * np.eye(len(codes))
     forth, back = (space.decode_some(codes + move, chosen) for move in (step, -step))
@@ -127,7 +127,9 @@ def test_every_joint_turns_about_any_axis_and_is_known(model: SmplModel) -> None
     assert still.fingerprint != body.fingerprint
     turns, shifts = random_turns(55)
     turns[:, 22:] = 0.0
-    found, of_all = (own.decode(own.space.codes_of_turns(turns, shifts)) for own in (still, body))
+    found, of_all = (
+        own.decode(own.space.codes_of_rotations(turns, shifts)) for own in (still, body)
+    )
     np.testing.assert_array_equal(found, of_all)
 
 
@@ -135,7 +137,7 @@ def test_a_pose_is_found_again_from_its_mesh(tmp_path: Path) -> None:
     np.savez(tmp_path / "model.npz", **tiny_arrays())
     body = RigBody.of(read_character(tmp_path / "model.npz"))
     turns = 0.3 * np.random.default_rng(1).normal(size=(1, 24, 3))
-    mesh = body.decode(body.space.codes_of_turns(turns, np.zeros((1, 3))))[0]
+    mesh = body.decode(body.space.codes_of_rotations(turns, np.zeros((1, 3))))[0]
     found = body.encode(mesh)
     assert found.fit_error_max < 1e-3
     assert np.abs(body.exported_vertices(found.latent, found.placement) - mesh).max() < 2e-3

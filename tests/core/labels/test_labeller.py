@@ -21,7 +21,7 @@ from lcollision_core.labels import (
     measures,
 )
 from lcollision_core.labels.labeller import _sum_energies
-from lcollision_core.options import Draws
+from lcollision_core.options import SampleDistribution
 from tests.core.contact.detector_checks import near_pairs
 from tests.core.labelled import as_bytes
 from tests.core.labels.conftest import SEED
@@ -144,10 +144,10 @@ def test_three_rows_in_ten_are_held_out_for_good() -> None:
 def test_mixed_samples_are_of_the_box_of_known_poses_and_at_the_border(
     tube_model: LearnedBody,
 ) -> None:
-    mixed, box = tube_model.labeller(Draws.MIXED), tube_model.labeller()
+    mixed, box = tube_model.labeller(SampleDistribution.MIXED), tube_model.labeller()
     rows, plain = (one.label_rows(SEED, range(640)) for one in (mixed, box))
     place = np.arange(640) % ROWS_PER_BLOCK
-    of_box = is_of_box(np.arange(640), Draws.MIXED)
+    of_box = is_of_box(np.arange(640), SampleDistribution.MIXED)
     assert of_box.mean() == 0.5
     assert np.array_equal(rows.latent[of_box], plain.latent[of_box])
     # Each row of a block gets the same label as alone.
@@ -159,7 +159,7 @@ def test_mixed_samples_are_of_the_box_of_known_poses_and_at_the_border(
 
 
 def test_a_part_of_a_mixed_block_is_that_of_the_whole(tube_model: LearnedBody) -> None:
-    labeller = tube_model.labeller(Draws.MIXED)
+    labeller = tube_model.labeller(SampleDistribution.MIXED)
     whole = labeller.label_rows(SEED, range(2 * ROWS_PER_BLOCK))
     for n_rows in (5, 30, ROWS_PER_BLOCK + 20):
         assert as_bytes(labeller.label_rows(SEED, range(n_rows))) == as_bytes(
@@ -171,7 +171,7 @@ def test_no_mixed_training_row_depends_on_one_that_measures(
     tube_model: LearnedBody, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Bisections use only rows that are not held out."""
-    labeller = tube_model.labeller(Draws.MIXED)
+    labeller = tube_model.labeller(SampleDistribution.MIXED)
     ends: list[LabelRows] = []
 
     def note_ends(_: Labeller, given: LabelRows, others: np.ndarray) -> Iterator[np.ndarray]:
@@ -180,7 +180,7 @@ def test_no_mixed_training_row_depends_on_one_that_measures(
 
     monkeypatch.setattr(Labeller, "_near_border", note_ends)
     rows = labeller.label_rows(SEED, range(320))
-    measuring = rows.latent[measures(np.arange(320), Draws.MIXED)]
+    measuring = rows.latent[measures(np.arange(320), SampleDistribution.MIXED)]
     assert 0.14 < len(measuring) / 320 < 0.16
     for given in ends:
         assert not (given.latent[:, None] == measuring[None]).all(axis=2).any()
@@ -189,7 +189,7 @@ def test_no_mixed_training_row_depends_on_one_that_measures(
 def test_where_nothing_collides_the_box_fills_a_mixed_block(tube_model: LearnedBody) -> None:
     """With rules that tolerate any depth."""
     rules = ContactRules(tolerated_depth=0.5)
-    labeller = replace(tube_model.labeller(Draws.MIXED), rules=rules)
+    labeller = replace(tube_model.labeller(SampleDistribution.MIXED), rules=rules)
     rows = labeller.label_rows(SEED, range(ROWS_PER_BLOCK))
     assert not rows.colliding.any()
     assert np.array_equal(rows.latent[24:], labeller.embedding.box.draw(SEED, 0)[24:])

@@ -85,19 +85,19 @@ def test_sentences_name_the_rules(counts: RuleCounts, sentence: str) -> None:
 
 
 def test_what_is_not_looked_at_is_said_in_short() -> None:
-    assert RuleCounts().described() == ContactRules().in_short() == ""
+    assert RuleCounts().described() == ContactRules().summary() == ""
     assert RuleCounts(rest=3, joint=40).described() == "3 touching at rest, 40 at joints"
-    assert ContactRules(0.1, 0.02, joint_exclusion=True).in_short() == (
+    assert ContactRules(0.1, 0.02, joint_exclusion=True).summary() == (
         "near along the surface, touching at rest, at joints"
     )
-    assert ALL.in_short().count(", ") == 5
+    assert ALL.summary().count(", ") == 5
 
 
 def test_depths_of_pairs_are_said_with_their_groups() -> None:
     said = "not deeper than 0.01 between Belly and Arm or 0.02 within Belly"
     assert TOLERANT.described() == f"pairs {said}"
     assert TOLERANT.sentence(RuleCounts(tolerated=3)) == f"3 pairs {said} are not counted"
-    assert TOLERANT.in_short() == "not deeper than tolerated"
+    assert TOLERANT.summary() == "not deeper than tolerated"
     assert TOLERANT.named_groups == ("Belly", "Arm")
     five = ContactRules(tolerated_depth=0.1, tolerated_pairs=(("a", "b", 0.2),) * 5)
     assert five.described().endswith("0.2 between a and b or as 2 more pairs of groups say")

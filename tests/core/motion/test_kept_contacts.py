@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.kept_contacts import Correspondence
 from lcollision_core.bodies.motions import read_motions
-from lcollision_core.bodies.retargeting import carried_motions
+from lcollision_core.bodies.retargeting import retargeted_motions
 from lcollision_core.files import Character, ClipFrames
 from lcollision_core.motion import Motion, MotionOptions, contact_report, resolve_motion
 from lcollision_core.options import ResolveOptions
@@ -114,7 +114,7 @@ def test_a_part_of_a_motion_has_its_contacts(source: Path, tmp_path: Path) -> No
 
 def test_places_correspond_along_and_around_their_limbs(source: Path, tmp_path: Path) -> None:
     body, _ = moved_onto(0.17, source, tmp_path)
-    ((motion, retargeting),) = carried_motions(body, source)
+    ((motion, retargeting),) = retargeted_motions(body, source)
     own = open_body(source)
     assert isinstance(own, RigBody)
     (source_motion,) = read_motions(own, source)

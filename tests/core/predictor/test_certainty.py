@@ -9,7 +9,7 @@ import pytest
 from scipy.special import expit, ndtr
 from scipy.stats import binom
 
-from lcollision_core.bodies import LearnedBody, judge_poses
+from lcollision_core.bodies import LearnedBody, check_poses
 from lcollision_core.options import RuleOptions
 from lcollision_core.predictor.metrics import ERROR_BOUNDS, SureRange, sure_ranges
 
@@ -85,17 +85,17 @@ def test_what_is_not_sure_is_checked_exactly(body: LearnedBody) -> None:
     metrics = replace(predictor.metrics, sure=(SureRange(1e-2, low, high, 0.5),))
     sure = body.with_predictor(replace(predictor, metrics=metrics))
 
-    exact = judge_poses(sure, latent)
+    exact = check_poses(sure, latent)
     assert exact.exact.all()
     assert np.array_equal(exact.colliding, truth)
-    assert judge_poses(sure, latent, 5e-3).exact.all()  # smaller than any known bound
-    hybrid = judge_poses(sure, latent, 2e-2)
+    assert check_poses(sure, latent, 5e-3).exact.all()  # smaller than any known bound
+    hybrid = check_poses(sure, latent, 2e-2)
     assert np.array_equal(hybrid.exact, (logit >= low) & (logit <= high))
     assert np.array_equal(hybrid.colliding[hybrid.exact], truth[hybrid.exact])
     assert np.array_equal(hybrid.colliding[~hybrid.exact], logit[~hybrid.exact] > high)
     # A free pose may still violate a clearance.
-    roomy = judge_poses(sure, latent, 2e-2, sure.detector.with_clearance(1e-3))
+    roomy = check_poses(sure, latent, 2e-2, sure.detector.with_clearance(1e-3))
     assert np.array_equal(roomy.exact, logit <= high)
     # The predictor does not know of tolerated depths.
     tolerant = sure.with_options(RuleOptions(tolerated_depth=1e-3))
-    assert judge_poses(tolerant, latent, 2e-2).exact.all()
+    assert check_poses(tolerant, latent, 2e-2).exact.all()

@@ -19,10 +19,10 @@ from lcollision_core.options import LearningRequest, Quality
 from lcollision_core.tasks.learning import (
     EFFORTS,
     MostlyCollidingError,
+    adapt_to_samples,
     estimated_seconds,
     first_samples,
     learn_model,
-    look_again,
     notes_of,
 )
 from lcollision_core.tasks.work_folder import WorkFolder
@@ -70,7 +70,7 @@ def test_layers_stay_on_what_they_cover_all_over_the_box() -> None:
 def test_places_that_touch_in_nearly_every_sample_are_left_out(
     always_touching: LearnedBody,
 ) -> None:
-    model, first = look_again(always_touching, REQUEST)
+    model, first = adapt_to_samples(always_touching, REQUEST)
     assert first.n_places == len(model.rules.touching) > 0
     vertices = model.decode(first_samples(model, 0))
     assert first.colliding_share == np.mean(model.detector.are_colliding(vertices)) < 0.8
@@ -83,7 +83,7 @@ def test_places_that_touch_in_nearly_every_sample_are_left_out(
 def test_the_box_is_made_smaller_but_never_than_the_poses_and_rules_of_the_request_stay(
     always_touching: LearnedBody,
 ) -> None:
-    model, first = look_again(always_touching, STRICT)
+    model, first = adapt_to_samples(always_touching, STRICT)
     assert (first.colliding_share, first.n_places, first.box_scale) == (1.0, 0, 1.0)
     assert model.rules == always_touching.rules
     assert set(first.parts) == {"component 1", "component 2"}
@@ -108,7 +108,7 @@ def test_a_run_stops_before_the_predictor_where_nearly_all_samples_collide(
     assert not work.labels.exists()
     # Other options need another folder while a run is unfinished, but not after this.
     other = replace(request, left_out=("component 2",))
-    work.go_on_regardless()
+    work.allow_mostly_colliding()
     assert work.request.regardless
     assert work.request == WorkFolder(work.destination).request
     with pytest.raises(LabelStoreError, match="training needs some of each"):

@@ -20,7 +20,7 @@ from lcollision_core.files import PoseSet, write_pose_set
 from lcollision_core.jobs import Job
 from lcollision_core.labels import LabelStore
 from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
-from lcollision_core.options import Draws, LearningRequest, Quality
+from lcollision_core.options import LearningRequest, Quality, SampleDistribution
 from lcollision_core.predictor import PRESETS
 from lcollision_core.tasks.learning import EFFORTS, Effort, LearnedCard, learn_model
 from lcollision_core.tasks.work_folder import WorkFolder, stamped
@@ -122,7 +122,7 @@ def test_a_run_that_is_cancelled_anywhere_goes_on_to_the_same_model(
             # After the last step, there is nothing left to cancel.
             assert stop > 0.7
             break
-        assert not work.is_held
+        assert not work.is_locked
     assert len(stages) >= 7
     assert {Stage.POSES, Stage.LATENT_SPACE, Stage.PREDICTOR} <= set(stages)
     parts = learn_model(work)
@@ -139,12 +139,12 @@ from lcollision_core.options import Quality
 from lcollision_core.tasks.learning import EFFORTS, learn_model
 from lcollision_core.tasks.work_folder import WorkFolder
 EFFORTS[Quality.QUICK] = SMALL
-tell = WorkFolder.tell
-def tell_and_wait_for_the_end(work, status):
-    tell(work, status)
+write_status = WorkFolder.write_status
+def write_and_wait_for_the_end(work, status):
+    write_status(work, status)
     if status.stage == sys.argv[2]:
         Event().wait()
-WorkFolder.tell = tell_and_wait_for_the_end
+WorkFolder.write_status = write_and_wait_for_the_end
 learn_model(WorkFolder(Path(sys.argv[1])))
 """
 
@@ -163,12 +163,12 @@ def test_a_run_that_is_killed_goes_on_to_the_same_model(
             assert time.monotonic() < give_up, f"{stage} has not begun"
             time.sleep(0.01)
         assert process.poll() is None, "it ended before it was killed"
-        assert work.is_held
+        assert work.is_locked
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
         # A killed process cannot report it: the status is running, but nobody holds the folder.
         assert work.status.state == RunState.RUNNING
-        assert not work.is_held
+        assert not work.is_locked
     killed = learn_model(work)
     assert numbers_of(killed.model) == numbers_of(whole[1].model)
 
@@ -182,7 +182,7 @@ def test_samples_are_mixed(tmp_path: Path, request_for_tube: LearningRequest) ->
             token.part(lambda status: token.cancel() if status.stage == Stage.PREDICTOR else None),
         )
     store = LabelStore.open(work.labels)
-    assert store.identity.draws == Draws.MIXED
+    assert store.identity.draws == SampleDistribution.MIXED
     assert store.n_rows == SMALL.n_samples
 
 
@@ -234,14 +234,14 @@ def test_two_processes_do_not_learn_the_same(
     tmp_path: Path, request_for_tube: LearningRequest
 ) -> None:
     work = work_in(tmp_path, request_for_tube)
-    with work.held():
-        assert work.is_held
+    with work.lock():
+        assert work.is_locked
         with (
             pytest.raises(ModelFileError, match="being learned by another process"),
-            work.held(wait=0.0),
+            work.lock(wait=0.0),
         ):
             pass
-    assert not work.is_held
+    assert not work.is_locked
 
 
 def test_what_cannot_be_learned_from_is_said_and_kept(tmp_path: Path) -> None:

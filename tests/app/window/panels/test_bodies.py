@@ -20,7 +20,7 @@ from app.window.main_window import MainWindow
 from app.window.widgets import NameLabel
 from lcollision_core.bodies import Body, as_scene, open_body
 from lcollision_core.bodies.scene_file import open_scene_file
-from lcollision_core.tasks.scenes import beside_each_other, kept_scene, with_body
+from lcollision_core.tasks.scenes import kept_scene, scene_of_files, with_body
 from tests.app.windows import PATIENCE, answer, close_window, drop, open_window, settings_in
 from tests.core.shapes import box
 from tests.rigged_shapes import rigged_body, write_gltf
@@ -55,7 +55,7 @@ def test_a_part_s_name_outlives_that_of_its_body(qtbot: QtBot) -> None:
 def test_bodies_of_a_scene_are_listed_locked_and_left_out(
     qtbot: QtBot, hero: Path, tmp_path: Path
 ) -> None:
-    scene = open_scene_file(kept_scene(beside_each_other([hero, hero])))
+    scene = open_scene_file(kept_scene(scene_of_files([hero, hero])))
     window = open_window(qtbot, PoseDocument(scene), settings_in(tmp_path))
     document, tree = window.document, window.bodies.tree
     assert window.docks["bodies"].isVisible()
@@ -112,7 +112,7 @@ def test_clips_of_a_scene_play_together_with_offsets_and_each_body_gets_its_file
     qtbot: QtBot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     moving = write_gltf(rigged_body(n_frames=8), tmp_path / "moving.glb")
-    scene = open_scene_file(kept_scene(beside_each_other([moving, moving])))
+    scene = open_scene_file(kept_scene(scene_of_files([moving, moving])))
     window = open_window(qtbot, PoseDocument(scene), settings_in(tmp_path))
     document, panel = window.document, window.bodies
     qtbot.waitUntil(lambda: document.timeline.motion is not None, timeout=PATIENCE)

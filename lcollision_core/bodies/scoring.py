@@ -45,7 +45,7 @@ class Verdicts:
     exact: npt.NDArray[np.bool_]
 
 
-def judge_poses(
+def check_poses(
     model: Body,
     latent: npt.ArrayLike,
     error_bound: float = 0.0,
@@ -98,7 +98,7 @@ def estimated_free(
 
     Parameters
     ----------
-    error_bound : see `judge_poses`
+    error_bound : see `check_poses`
     clearance : normalised; if above 0, no frame is estimated to be free
     """
     bound = error_bound if motion.space_at is None else 0.0
@@ -166,7 +166,7 @@ def sample_poses(
     n_kept = n_misses = 0
     while n_kept < n_poses:
         drawn = model.sample(_DRAWN_AT_ONCE, generator)
-        verdicts = judge_poses(model, drawn, error_bound, detector)
+        verdicts = check_poses(model, drawn, error_bound, detector)
         matching = drawn[verdicts.colliding == colliding][: n_poses - n_kept]
         samples[n_kept : n_kept + len(matching)] = matching
         n_kept += len(matching)
@@ -249,7 +249,7 @@ def score_kinds(
         job.check()
         if len(latent):
             called = predictor.predict(latent).collision_probability > threshold
-            scores.append(KindScores.of(kind.value, called, judge_poses(model, latent).colliding))
+            scores.append(KindScores.of(kind.value, called, check_poses(model, latent).colliding))
         job.report(done, len(kinds))
     return tuple(scores)
 
@@ -299,7 +299,7 @@ def _resolved(
             model.embedding.draws.noisy_blends(n_poses, generator.random),
         ]
     )
-    colliding = np.flatnonzero(judge_poses(model, drawn).colliding)
+    colliding = np.flatnonzero(check_poses(model, drawn).colliding)
     sample_numbers = generator.permutation(colliding)[:n_wanted]
     # Samples have no largest change.
     options = ResolveOptions(clearance=CLEARANCE, largest_change=None)

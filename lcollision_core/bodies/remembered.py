@@ -24,11 +24,11 @@ from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileErro
 from lcollision_core.files import (
     Character,
     Mesh,
-    as_read,
     locked,
     read_character,
     read_own_file,
-    turned,
+    with_up_axis,
+    without_user_choices,
 )
 from lcollision_core.files.safe import atomic_write, read_regular
 from lcollision_core.files.scene.smpl import refuse_pickle
@@ -47,7 +47,7 @@ _PARTS = ("domain_names", "domain_colours", "domain_order")
 
 
 @dataclass(frozen=True)
-class KnownCharacter:
+class RememberedChoices:
     """Choices remembered for a rig; None for what was not chosen.
 
     Attributes
@@ -78,7 +78,7 @@ def user_characters_folder() -> Path:
     return user_data_path("lcollision", appauthor=False) / "characters"
 
 
-def known_character(fingerprint: str) -> KnownCharacter | None:
+def known_character(fingerprint: str) -> RememberedChoices | None:
     """Return the choices remembered for a rig, None if there are none.
 
     Parameters
@@ -97,14 +97,14 @@ def known_character(fingerprint: str) -> KnownCharacter | None:
         version = document.get("format_version")
         if isinstance(version, int) and version > _VERSION:
             raise ModelFileError.too_new(path, quoted(version), _VERSION)
-        return from_json(KnownCharacter, document, "the character")
+        return from_json(RememberedChoices, document, "the character")
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
         raise ModelFileError.unreadable(path, error, "remove it, and choose again") from error
 
 
-def _readable_character(fingerprint: str) -> KnownCharacter | None:
+def _readable_character(fingerprint: str) -> RememberedChoices | None:
     """Return the choices remembered for a rig; None if there are none or they are unreadable."""
     try:
         return known_character(fingerprint)
@@ -149,14 +149,16 @@ def open_character(
     MeshFileError : see `read_character`.
     LCollisionError : the character has no rig.
     """
-    character = as_read(source) if isinstance(source, Character) else read_character(source)
+    character = (
+        without_user_choices(source) if isinstance(source, Character) else read_character(source)
+    )
     if not clips:
         character = replace(character, clips={})
-    model = RigBody.of(character if up is None else turned(character, up))
+    model = RigBody.of(character if up is None else with_up_axis(character, up))
     try:
         entry = known_character(model.fingerprint) if up is None else None
         if entry is not None and entry.up_axis is not None:
-            model = RigBody.of(turned(character, entry.up_axis))
+            model = RigBody.of(with_up_axis(character, entry.up_axis))
             entry = known_character(model.fingerprint)
         entry = entry or known_character(model.fingerprint)
         if entry is not None and entry.roles is not None:
@@ -270,7 +272,7 @@ def remember_up(model: Body, up: int) -> None:
     """
     if model.character is None:
         return
-    read_body = RigBody.of(as_read(model.character))
+    read_body = RigBody.of(without_user_choices(model.character))
     chosen_axis = None if up == read_body.up_axis else up
     _change(read_body, lambda known: replace(known, up_axis=chosen_axis))
 
@@ -334,7 +336,7 @@ def is_offer_declined(model: Body) -> bool:
     return entry is not None and entry.offer_declined is True
 
 
-def _change(model: Body, change: Callable[[KnownCharacter], KnownCharacter]) -> None:
+def _change(model: Body, change: Callable[[RememberedChoices], RememberedChoices]) -> None:
     """Change the choices remembered for a body, under a lock.
 
     Does nothing for bodies without joints: a model's own file stores its choices.
@@ -346,7 +348,7 @@ def _change(model: Body, change: Callable[[KnownCharacter], KnownCharacter]) -> 
         path.parent.mkdir(parents=True, exist_ok=True)
         with locked(path):
             before = known_character(model.fingerprint)
-            known = change(before or KnownCharacter(str(model.own_file)))
+            known = change(before or RememberedChoices(str(model.own_file)))
             known = replace(known, mesh=_digest(model.topology))
             if known == before:
                 return
