@@ -89,7 +89,7 @@ def time_drags(
     training = model.decode(model.known_poses.astype(np.float64), n_threads=1)
     free = ~model.detector.are_colliding(training.astype(np.float32))
     if not free.any():
-        raise LCollisionError("no training pose is free", "name another model", where=model.name)
+        raise LCollisionError("no training pose is free", "use another model", where=model.name)
     first = int(free.argmax())
     start = model.known_poses[first].astype(np.float64)
     drags = _scripted(model, training[first], training, n_targets, np.random.default_rng(0))
@@ -167,7 +167,7 @@ def _places_on_rig(model: Body, space: RigPoseSpace) -> dict[str, int]:
     missing = {"head", *sides} - parts.keys()
     if missing:
         raise LCollisionError(
-            f"has no {min(missing)} to drag", "name another character", where=model.name
+            f"has no {min(missing)} to drag", "use another character", where=model.name
         )
     places = {"head": far_end(space, parts["head"])}
     for side in ("left", "right"):

@@ -97,7 +97,7 @@ def time_editor(models: Sequence[str], n_actions: int, job: Job = UNWATCHED) -> 
     reason = why_no_window(os.environ, sys.platform)
     if reason is not None:
         raise LCollisionError(
-            f"there is no display to open a window on ({reason})",
+            f"no display is available ({reason})",
             'run it on a desktop, or in xvfb-run -a -s "-screen 0 1600x1000x24"',
         )
     rows = []
@@ -145,7 +145,7 @@ def _run(model: Path, n_actions: int) -> Row:
     try:
         answer = json.loads(ended.stdout.splitlines()[-1])
     except (IndexError, ValueError) as error:
-        last = (ended.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        last = (ended.stderr.strip().splitlines() or ["no output"])[-1]
         raise LCollisionError(
             f"the editor ended early on {model} with status {ended.returncode} ({last})",
             f"start it with `lcollision edit --model {model}` to see why",

@@ -116,7 +116,7 @@ def parts_of(layers: Sequence[solids.Layer], wall: float) -> list[ClosedMesh]:
 
 
 def printed_rows(names: Sequence[str], n_poses: int, job: Job = UNWATCHED) -> list[Row]:
-    """Print random poses of each body, and judge the files."""
+    """Print random poses of each body, and check the files."""
     rows: list[Row] = []
     options = PrintOptions()
     for name in names:

@@ -114,7 +114,7 @@ def resolve(
         ),
     ] = None,
     made: Annotated[
-        bool, typer.Option("--made", help="Resolve poses as people make them of a character.")
+        bool, typer.Option("--made", help="Resolve realistic poses of a character.")
     ] = False,
     n_poses: Annotated[
         int, typer.Option("-n", min=1, max=100_000, metavar="N", help="Colliding poses.")
@@ -264,7 +264,7 @@ def gpu(
     ] = 10_000,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare exact checks on a GPU with the processor's: what they find, and how soon."""
+    """Compare exact checks on GPU and CPU: results and speed."""
     from app.benchmarks.gpu import blended_poses, time_checks, time_gpu
     from lcollision_core.bodies import MeshBody, open_body
     from lcollision_core.files import read_pose_set
@@ -325,7 +325,7 @@ def contacts(
     workers: ThreadsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Move three motions of the built-in figure onto a slim and a heavy one, with their contacts.
+    """Retarget three motions of the built-in figure to a slim and a heavy one, keeping contacts.
 
     The figures are built first, which takes minutes and needs the extra 'body'.
     """
@@ -344,7 +344,7 @@ def printing(
     n_poses: Annotated[int, typer.Option("-n", min=1, metavar="N", help="Poses of each.")] = 10,
     as_json: JsonOption = False,
 ) -> None:
-    """Print random poses, and judge the files by other programs than make them."""
+    """Print random poses, and check the files with independent programs."""
     from app.benchmarks.printing import printed_rows
 
     with cancel_on_interrupt() as job, progress_bar("Printing poses", job) as job:

@@ -80,9 +80,9 @@ def check(
     penetrate.
 
     With --with or --ground, the meshes or clips are those of a scene: pairs between bodies all
-    count. A scene's file, which the editor saves, is one too.
+    count. A scene file saved by the editor counts as a scene.
 
-    Of several clips, a table follows, the deepest first. With --clips, --error-bound and the --body
+    For several clips, a table follows, deepest first. With --clips, --error-bound and the --body
     of a learned model, frames that its predictor is sure are free are not checked.
     """
     choose_device(device, note)

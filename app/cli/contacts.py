@@ -36,8 +36,8 @@ def contacts(
 ) -> None:
     """Show which pairs of faces a model or a character does not count, or change that.
 
-    Options add to the current rules and are stored: a character's in your data folder, where the
-    editor finds them too; those of a model without a predictor in its file.
+    Options add to the current rules and are stored: for a character in your data folder, which the
+    editor reads; for a model without a predictor in its file.
     """
     from lcollision_core.bodies import open_body, propose_rules
     from lcollision_core.meshes.contact_rules import pair_in_words

@@ -46,8 +46,8 @@ ThreadsOption = Annotated[
 DeviceOption = Annotated[
     Device,
     typer.Option(
-        help="What checks batches of poses: the processor, or a GPU (needs the extra gpu); auto "
-        "takes a GPU where there is one and the batch is worth it.",
+        help="Device that checks batches of poses; auto uses a GPU (needs the extra gpu) if there "
+        "is one and the batch is large enough.",
     ),
 ]
 ErrorBoundOption = Annotated[

@@ -70,9 +70,9 @@ def label(
 ) -> None:
     """Draw poses from the model's latent box and find their exact collisions.
 
-    You can stop it at any time: the store keeps the finished chunks, and the same command
-    continues from there. The rows do not depend on who labels them, but for rounding on a GPU.
-    Damaged rows are labelled again.
+    You can stop it at any time: the store keeps the finished chunks, and the same command continues
+    from there. The rows don't depend on the machine, except for rounding on a GPU. Damaged rows are
+    labelled again.
     """
     from lcollision_core.bodies import LearnedBody
     from lcollision_core.labels import LabelStore, label_poses

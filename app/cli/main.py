@@ -88,12 +88,12 @@ class _Commands(TyperGroup):
         except LCollisionError as error:
             sentence = str(error)
         except MemoryError:
-            sentence = "out of memory; give it smaller meshes or fewer poses"
+            sentence = "out of memory; use smaller meshes or fewer poses"
         except OSError as error:
             sentence = f"{error.filename}: {error.strerror}; choose another name or folder"
             if error.errno == errno.ENOSPC:
                 _drop_what_is_buffered()
-                sentence = "the answer cannot be written: the disk is full"
+                sentence = "can't write the output: the disk is full"
             elif error.filename is None:
                 raise
         note(sentence)

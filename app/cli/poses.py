@@ -119,8 +119,8 @@ def sample(
 ) -> None:
     """Draw random poses: of a model from its latent box, of a character within human limits.
 
-    With --with, they are poses of a scene; what is fixed stands still, and nothing changes its
-    place but for the turns of its joints.
+    With --with, they are poses of a scene; fixed bodies don't move, and the others only turn their
+    joints.
     """
     from lcollision_core.bodies import NamedPose, sample_poses
     from lcollision_core.tasks.exporting import require_output, write_result

@@ -44,14 +44,14 @@ def print_figure(
 
     The pose is resolved first. Then all its layers become one volume without inner walls: closed
     ones are joined; of open ones, the holes of hulls are closed, and sheets, as cloth and hair, are
-    made as thick as --wall; parts that stand loose by little are joined by pins. What lies enclosed
-    is filled. What cannot be one volume is refused with the place.
+    made as thick as --wall; parts that are slightly apart are joined by pins. What lies enclosed is
+    filled. A pose that can't become one volume is refused, with the place.
 
-    The wall is measured at some 4000 places spread evenly over the surface, along the normal
+    The wall is measured at about 4000 points spread evenly over the surface, along the normal
     inwards. Where closed parts are thinner than --wall is reported, and left as it is.
 
-    Exits with 1 where the pose could not be resolved: the file is written, with what still collides
-    grown together.
+    Exits with 1 if the pose could not be resolved; the file is still written, with the colliding
+    parts merged.
     """
     from lcollision_core.tasks.exporting import refuse_to_replace, source_files
     from lcollision_core.tasks.inputs import read_input_poses

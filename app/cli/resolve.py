@@ -169,23 +169,23 @@ def resolve(
     model pose; --keep-detail adds what that lacks. You can stop it at any time: finished poses are
     kept beside the output, and the same command continues.
 
-    The step that resolved a pose is one of: solver, the paper's problem; margin, the same with more
-    distance from collision; polish, for shallow contacts; start, a restart elsewhere; towards, from
-    a free pose as near to the target as contacts allow (for characters, which have no predictor);
-    push-out, out of the contacts by joints, where that is nearer; walk-back, along the way to a
+    The step that resolved a pose is one of: solver, the paper's problem; margin, the same with a
+    larger margin; polish, for shallow contacts; start, a restart elsewhere; towards, from a free
+    pose as near to the target as contacts allow (for characters, which have no predictor);
+    push-out, moved out of contact by the joints, if that is nearer; walk-back, along the way to a
     pose known to be free; soft, the least overlap within --soft.
 
-    With --motion, colliding spans of whole motions are resolved, and all else stays as it is. Where
-    OUT is a .glb or .vrm file, that is the character's own file with all its clips, and new keys in
-    those spans only (an FBX comes back as a GLB with its rig); clips without a mesh, or of another
-    character, become new clips of it. What touches on another character's body, or the ground,
-    touches on this one too, unless --no-keep-contacts is given. A .bvh file, or a .npz file of
-    SMPL, SMPL-H or SMPL-X (as of AMASS; M is the .npz file of that model), is the one that was read
-    with other turns there; else a .bvh or .vrma file holds how a character's joints move, without
-    its mesh. Or OUT is a .pc2 or .mdd file, a folder or a .json file. The motions of a folder and
-    its subfolders, or several files, come to a folder, each to its own file, with a table of all,
-    motions.csv. A frame that still collides is named, the rest is written, and the command exits
-    with 1.
+    With --motion, colliding spans of whole motions are resolved, and everything else is unchanged.
+    Where OUT is a .glb or .vrm file, that is the character's own file with all its clips, and new
+    keys in those spans only (an FBX comes back as a GLB with its rig); clips without a mesh, or of
+    another character, become new clips of it. What touches on another character's body, or the
+    ground, touches on this one too, unless --no-keep-contacts is given. A .bvh file, or a .npz file
+    of SMPL, SMPL-H or SMPL-X (as of AMASS; M is the .npz file of that model), is the one that was
+    read with other turns there; else a .bvh or .vrma file holds how a character's joints move,
+    without its mesh. Or OUT is a .pc2 or .mdd file, a folder or a .json file. The motions of a
+    folder and its subfolders, or several files, come to a folder, each to its own file, with a
+    table of all, motions.csv. A frame that still collides is named, the rest is written, and the
+    command exits with 1.
 
     With --with or --ground, the poses are those of a scene of several bodies, one file for each, or
     none where they stand as their files say; with --motion their clips play together: see --play.

@@ -244,7 +244,7 @@ def test_full_disk_is_no_bug(apart: Path) -> None:
         )
     assert result.returncode == 2
     assert result.stderr.splitlines()[-1] == (
-        "lcollision: the answer cannot be written: the disk is full"
+        "lcollision: can't write the output: the disk is full"
     )
 
 
