@@ -263,7 +263,7 @@ def verdict(frames: Frames, settings: bpy.types.PropertyGroup) -> str:
 
 
 class LCOLLISION_OT_check_action(ModalOperator, bpy.types.Operator):
-    """Find the frames of the action in which the character runs into itself"""
+    """Find the frames of the action with self-collisions"""
 
     bl_idname = "lcollision.check_action"
     bl_label = "Check Action"
@@ -281,7 +281,7 @@ class LCOLLISION_OT_check_action(ModalOperator, bpy.types.Operator):
 
 
 class LCOLLISION_OT_resolve_action(ModalOperator, bpy.types.Operator):
-    """Copy the action and key the copy where the character runs into itself, as smooth as it was"""
+    """Copy the action and resolve its self-collisions, keeping it smooth"""
 
     bl_idname = "lcollision.resolve_action"
     bl_label = "Resolve Action"

@@ -22,7 +22,7 @@ CACHE = "LCollision Cache"
 REPORT = "Cloth Report"
 """Name of the text with the report."""
 
-_SHOWN_OTHERWISE = "Blender shows it otherwise than its bones alone would"
+_SHOWN_OTHERWISE = "Blender shows it differently from its bones"
 
 
 class LCOLLISION_OT_prepare_cloth(ModalOperator, bpy.types.Operator):
@@ -93,7 +93,7 @@ def _reasons(resolved: Resolved, now: Frames) -> dict[int, str]:
     for span in resolved.kept:
         first, last = span["frames"]
         told |= {numbers[at]: span["reason"] for at in range(first, last + 1)}
-    rest = "; ".join(f"{name} takes no keys ({why})" for name, why in resolved.unkeyable.items())
+    rest = "; ".join(f"{name} can't be keyed ({why})" for name, why in resolved.unkeyable.items())
     return {
         now.numbers[at]: told.get(now.numbers[at], rest or _SHOWN_OTHERWISE) for at in now.colliding
     }

@@ -59,7 +59,7 @@ def curves_of(action: bpy.types.Action, item: bpy.types.Object) -> list[bpy.type
 
 
 def check_keyable(rigged: Rigged) -> None:
-    """Refuse an armature whose action takes no keys.
+    """Refuse an armature whose action can't be keyed.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def check_keyable(rigged: Rigged) -> None:
     action = None if data is None else data.action
     if action is not None and action.library is not None:
         raise SceneError(
-            f"{action.name} is linked from another file and takes no keys; make it local first, "
+            f"{action.name} is linked from another file and can't be keyed; make it local first, "
             "or switch auto-keying off"
         )
 

@@ -98,7 +98,7 @@ def counted(n: int, noun: str) -> str:
 
 
 class LCOLLISION_OT_check_pose(ModalOperator, bpy.types.Operator):
-    """Find where the character as it is shown runs into itself"""
+    """Find self-collisions of the character as shown"""
 
     bl_idname = "lcollision.check_pose"
     bl_label = "Check Pose"
@@ -117,7 +117,7 @@ class LCOLLISION_OT_check_pose(ModalOperator, bpy.types.Operator):
 
 
 class LCOLLISION_OT_resolve_pose(ModalOperator, bpy.types.Operator):
-    """Turn the bones to the nearest pose in which the character does not run into itself"""
+    """Turn the bones to the nearest pose without self-collisions"""
 
     bl_idname = "lcollision.resolve_pose"
     bl_label = "Resolve Pose"
@@ -292,7 +292,7 @@ def _rest(rigged: Rigged, reply: dict) -> str:
     if not others:
         return reply["note"]
     further = f" and {len(others) - _MOST_NAMED} more" if len(others) > _MOST_NAMED else ""
-    return f"the rest is moved by {', '.join(others[:_MOST_NAMED])}{further}"
+    return f"the remaining collisions come from {', '.join(others[:_MOST_NAMED])}{further}"
 
 
 _CLASSES = (LCOLLISION_OT_check_pose, LCOLLISION_OT_resolve_pose)

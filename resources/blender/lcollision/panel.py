@@ -67,7 +67,7 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
     )
     use_range: BoolProperty(
         name="Frame Range",
-        description="Check and resolve these frames alone, not all of the action's",
+        description="Only check and resolve these frames",
     )
     first_frame: IntProperty(name="Start", default=1)
     last_frame: IntProperty(name="End", default=250)
@@ -370,7 +370,7 @@ def _say(layout: bpy.types.UILayout, text: str, icon: str = "NONE") -> None:
 def where_written(rigged: Rigged) -> str:
     """Return a sentence on where Resolve writes."""
     if rigged.is_driven and rigged.may_have_controls:
-        return "Writes to the controls where these can free it, else to a baked copy"
+        return "Writes to the controls if they can resolve it, else to a baked copy"
     if rigged.is_driven:
         return "Writes to a baked copy: bones have constraints or drivers"
     return "Writes to the deforming bones"

@@ -162,7 +162,7 @@ def _array(values: dict) -> np.ndarray:
 
 
 class LCOLLISION_OT_clear(bpy.types.Operator):
-    """Take away what was found: the coloured faces, the verdict, the frames and their markers"""
+    """Clear the results: coloured faces, verdict, frames and markers"""
 
     bl_idname = "lcollision.clear"
     bl_label = "Clear"

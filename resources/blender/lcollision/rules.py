@@ -120,7 +120,7 @@ class LCOLLISION_OT_ignore_places(bpy.types.Operator):
 
 
 class LCOLLISION_OT_count_places(bpy.types.Operator):
-    """Count what is at these places again"""
+    """Count contacts at these places again"""
 
     bl_idname = "lcollision.count_places"
     bl_label = "Count Again"

@@ -37,7 +37,7 @@ def crossing_the_arm(told: Any, points: Any) -> int:
 
 def test_a_pose_is_resolved_by_the_controls_of_rigifys_human(human: Any) -> None:
     told = human["pose"]
-    said = "Writes to the controls where these can free it, else to a baked copy"
+    said = "Writes to the controls if they can resolve it, else to a baked copy"
     assert f"label: {said}" in human["panel"]
     assert human["checked"]["verdict"].startswith("Colliding: ")
     assert crossing_the_arm(human, told["before"]["points"]) > 50
