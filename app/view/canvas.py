@@ -381,7 +381,7 @@ _HINTS = (
 )
 """Hints shown while the body is dragged."""
 
-_WHOLE_BODY_HINT = "begin with Ctrl+Shift: the whole body helps"
+_WHOLE_BODY_HINT = "Ctrl+Shift-drag: move the whole body"
 
 _Drag = Callable[[QPointF], None]
 
@@ -456,12 +456,12 @@ class Mouse(QObject):
     pin : index of the pin under the pointer, or None
     handle : the body part whose handle is under the pointer, or None
     arrows : vertex whose patch has arrows to drag, or None
-    whole_body_drag : whether the whole body helps in the current drag
+    whole_body_drag : whether the current drag moves the whole body
 
     Signals
     -------
     pointed : QPointF in the canvas, the pointer, or None; `vertex` or `pin` may have changed
-    whole_body_dragged : QPointF in the canvas, the pointer in a drag in which the whole body helps
+    whole_body_dragged : QPointF in the canvas, the pointer in a drag that moves the whole body
     hinted : str, hint for the current drag; "" as it ends
     camera_moved : View, the requested camera
     redraw_wanted : the patch or the lines have changed

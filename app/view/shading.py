@@ -160,12 +160,12 @@ class Shader:
             note = "stronger colour = only this part"
             return Legend(shading.value, note, ramp=greys, ticks=ends)
         if shading is Shading.PREDICTED and not has_predictor:
-            return Legend(shading.value, "this model does not predict")
+            return Legend(shading.value, "this model has no predictor")
         is_free = known.vertex_energy is not None and not known.vertex_energy.any()
         crossing = uncounted = ""
         if shading is Shading.PREDICTED:
             note = "computing…" if known.domain_energy is None else UNIT
-            note = "the check found none" if is_free else note
+            note = "no collisions (checked)" if is_free else note
             ticks = _ticks(FULL_PREDICTED, " or more")
         elif shading is Shading.EXACT:
             note = "checking…" if known.vertex_energy is None else UNIT

@@ -138,7 +138,7 @@ _TURN_MILLISECONDS = 260
 
 Float32Array = npt.NDArray[np.float32]
 
-_HELPED = ", the whole body helps"
+_HELPED = ", whole body"
 
 _CLOSE_UP = 0.12
 """Half the side of the box framed by a close-up, as a fraction of the body size."""

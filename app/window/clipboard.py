@@ -86,7 +86,7 @@ def paste_pose(document: PoseDocument, vertex: int | None = None) -> None:
     pasted_codes &= _codes_of(document, vertex)
     if not pasted_codes.any():
         raise LCollisionError(
-            f"what was copied, {copied.what}, has nothing of this limb", "copy the whole pose"
+            f"the copied pose ({copied.what}) has no values for this limb", "copy the whole pose"
         )
     what = "pose" if vertex is None and pasted_codes.all() else "limb"
     document.motion.paste(f"Paste {what}", np.array(copied.latent), pasted_codes)
@@ -109,7 +109,7 @@ def _on_clipboard() -> CopiedPose:
         if not (
             np.isfinite(copied.latent).all() and all(0 <= code < size for code in copied.codes)
         ):
-            raise ValueError("it holds what no pose does")
+            raise ValueError("the clipboard holds invalid values")
     except ValueError as error:
         raise LCollisionError(
             "there is no pose on the clipboard", "copy one first, by Edit > Copy pose"

@@ -215,5 +215,5 @@ def indicator_text(run: LearningRun) -> str:
         RunState.WAITING: f"{name} is queued",
         RunState.STOPPING: f"Learning {name}: stopping",
         RunState.DONE: f"{name} is ready",
-        RunState.STOPPED: f"Learning {name}: stopped",
-    }.get(run.state, f"Learning {name} has stopped: see why")
+        RunState.STOPPED: f"Learning {name}: paused",
+    }.get(run.state, f"Learning {name} failed: see why")

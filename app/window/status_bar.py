@@ -33,7 +33,7 @@ class StatusBar(QStatusBar):
         self._ring = Ring(_RING_SIDE)
         self.cancel = QToolButton()
         self.cancel.setText("Cancel")
-        self.cancel.setToolTip("Stop what is being exported")
+        self.cancel.setToolTip("Cancel the export")
         self._facts = labelled("", "caption")
         for widget in (self.busy, self._ring, self._bar, self.cancel, self._facts):
             self.addPermanentWidget(widget)

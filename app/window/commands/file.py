@@ -8,7 +8,7 @@ from app.window.command import EditorWindow, Menu, unless, without_body
 
 FILE = Menu("&File")
 
-_NO_CHARACTER = "This is no single character; open a character's own file to learn it"
+_NO_CHARACTER = "Only a single character can be learned; open its own file"
 
 
 @FILE.command("new", "&New pose", "Ctrl+N", "Start again from the first pose of the body", "new")

@@ -67,7 +67,7 @@ def _export(window: EditorWindow) -> None:
 
 
 @MOTION.command(
-    "video", "Save &video…", "Ctrl+Alt+V", "Save the motion as a GIF, a WebP or numbered pictures"
+    "video", "Save &video…", "Ctrl+Alt+V", "Save the motion as a GIF, a WebP or numbered images"
 )
 @greyed(_why_not_filmed)
 def _film(window: EditorWindow) -> None:

@@ -116,14 +116,14 @@ def _has_ground(window: EditorWindow) -> bool:
 
 @POSE.command(
     "ground",
-    "Groun&d counts",
+    "Collide with groun&d",
     "Ctrl+Shift+G",
-    "Let nothing sink into the ground on which the body stands at rest: in drags, Resolve, motions",
+    "Check collisions with the ground under the rest pose, in drags, Resolve and motions",
 )
 @ticked(_has_ground)
 @unless(
     lambda window: not window.document.model.is_trained,
-    "Poses of a learned model have no place of their own; open a character",
+    "A learned model has no fixed ground; open a character",
 )
 def _toggle_ground(window: EditorWindow) -> None:
     window.files.toggle_ground()
@@ -131,7 +131,7 @@ def _toggle_ground(window: EditorWindow) -> None:
 
 @POSE.command(
     "whole_body",
-    "Whole &body helps",
+    "Move whole &body",
     "Ctrl+Alt+W",
     "Let drags move the whole body, not only the limb under the pointer, until the editor closes",
 )

@@ -79,10 +79,10 @@ class BodyPartsDialog(QDialog):
             f"“{model.name}” is bundled with the program and can't be changed: your changes go to "
             f"a copy among your models, which opens in its place with this pose."
             if copies
-            else "The changes are saved in the model's file. Undo does not revert them."
+            else "The changes are saved in the model's file. Undo doesn't revert them."
         )
         if not model.is_trained:
-            note = "The changes are remembered for this character; its file is not changed."
+            note = "The changes are remembered for this character; its file isn't changed."
         self.copy_name = QLineEdit(free_model_name(model.name, 2))
         self.copy_name.setAccessibleName("Name of the copy")
         copy_row = QWidget()

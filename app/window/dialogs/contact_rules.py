@@ -282,7 +282,7 @@ class ContactsDialog(QDialog):
                 f"them, train a model with other rules."
             )
         if not model.is_trained:
-            return "The rules are remembered for this character; its file is not changed."
+            return "The rules are remembered for this character; its file isn't changed."
         return ""
 
     @Slot()
@@ -336,7 +336,7 @@ class ContactsDialog(QDialog):
         left = counted(found.n_counted, "pair")
         count_text = f"At rest {counted(found.excluded.total, 'pair')} not counted, {left} counted."
         if found.n_counted:
-            count_text += " While pairs collide at rest, no pose is free: widen a rule."
+            count_text += " Pairs that collide at rest collide in every pose: widen a rule."
         self._write(self.total, count_text)
 
     @Slot()
@@ -436,8 +436,8 @@ class ContactsDialog(QDialog):
             return sum(size[pair.groups[0]] * size[pair.groups[1]] for pair in proposals[kind])
 
         first = min((kind for kind in proposals if proposals[kind]), key=left_out)
-        begin = f"Begin with {first}, which leaves out the least; the selection is tinted."
-        self._write(self.total, begin)
+        start = f"Start with {first}, which excludes the fewest pairs; the selection is tinted."
+        self._write(self.total, start)
 
     def _groups(self) -> list[FaceGroup]:
         return [group for kind in self._document.model.groups_by_kind.values() for group in kind]

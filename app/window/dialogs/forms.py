@@ -225,7 +225,7 @@ def video_form(settings: Settings, parent: QWidget, of_motion: bool = False) -> 
     meanings = {
         "gif": f"256 colours, at most {FASTEST_GIF} frames per second, never transparent.",
         "webp": "All colours, smaller than a GIF.",
-        "png": "A new folder of numbered pictures, for example to make an MP4.",
+        "png": "Numbered images in a new folder, for example to make an MP4.",
     }
 
     def follow() -> None:
@@ -604,8 +604,10 @@ _CLIP = (
     "Your own file with its clip changed where the motion was: the other clips, and the keys of "
     "untouched frames, stay as they are."
 )
-_OWN = "Your own file with other turns where the motion was changed; all else stays as it is."
-_CLIPS_LEFT = " Its clips are left out, as they would hide the pose."
+_OWN = (
+    "Your own file with new rotations where the motion was changed; everything else is unchanged."
+)
+_CLIPS_LEFT = " Its clips are left out: a playing clip would hide the pose."
 _CLIPS_KEPT = " Its clips stay; programs that play a clip on opening show that first."
 _GLB = "A GLB file is always y up and in metres, as its standard requires."
 

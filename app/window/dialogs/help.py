@@ -36,7 +36,7 @@ _MOUSE_AND_KEYS = (
         (
             ("Drag the body", "move the patch under the pointer"),
             ("Wheel or page keys while dragging", "bring the patch nearer or move it away"),
-            ("Ctrl+Shift-drag the body", "let the whole body help"),
+            ("Ctrl+Shift-drag the body", "move the whole body"),
             ("Ctrl-drag the body", "twist the body part"),
             ("Drag a dot on the body", "move a part that is small on the screen"),
             ("Escape while dragging", "put everything back"),

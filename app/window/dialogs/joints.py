@@ -71,10 +71,10 @@ class JointsDialog(QDialog):
                 cards.append(self._card(title, rows, motion, body))
         about = (
             f"Each joint of “{body}” turns as the joint of “{motion}” that is chosen beside it. "
-            "What has none goes along with what it hangs on."
+            "A joint without one moves with its parent."
         )
         if match.unsure:
-            about += " Those on top could not be told by their names and places."
+            about += " The joints at the top could not be matched by name and position."
         page = QWidget()
         page.setLayout(vbox(*cards, None, spacing=NORMAL, margins=(0, 0, CLOSE, 0)))
         area = scrolling(page)
@@ -105,7 +105,7 @@ class JointsDialog(QDialog):
             if joint in self._match.unsure:
                 sign = ThemedIcon(_SIGN)
                 sign.show_icon("question", "colliding")
-                sign.setToolTip("Not told by names and places")
+                sign.setToolTip("Not recognised by name and position")
                 grid.addWidget(sign, row, 0)
             grid.addWidget(choice, row, 1)
             grid.addWidget(labelled("→", "caption"), row, 2)

@@ -205,10 +205,10 @@ class LearningDialog(QDialog):
             RunState.WAITING: f"“{name}” is queued",
             RunState.RUNNING: f"Learning “{name}”",
             RunState.STOPPING: f"Stopping “{name}”",
-            RunState.STOPPED: f"“{name}” is stopped",
+            RunState.STOPPED: f"“{name}” is paused",
             RunState.DONE: f"“{name}” is ready",
         }
-        self.headline.setText(headlines.get(state, f"Learning “{name}” has stopped"))
+        self.headline.setText(headlines.get(state, f"Learning “{name}” failed"))
         self.state.setText(self._state(run))
         signs = {RunState.DONE: ("check", "free"), RunState.STOPPED: ("wait", "waiting")}
         failed = state in (RunState.FAILED, RunState.KILLED)
@@ -256,9 +256,8 @@ class LearningDialog(QDialog):
         if state in (RunState.FAILED, RunState.KILLED):
             return f"{with_capital(one_line(run.status.sentence))}."
         if state == RunState.DONE:
-            return (
-                f"It is one of your models now. It took {spent_text(sum(status.seconds.values()))}."
-            )
+            seconds = sum(status.seconds.values())
+            return f"Added to your models. Training took {spent_text(seconds)}."
         if state == RunState.WAITING:
             others = [run.name for run in self._runs.runs if run.state == RunState.RUNNING]
             when = f"after “{one_line(others[0])}”" if others else "in a moment"

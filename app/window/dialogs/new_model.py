@@ -763,7 +763,7 @@ class NewModelDialog(QDialog):
         sentence = "; ".join(filter(None, (failure.headline, failure.next_step)))
         self.files.tell(f"{with_capital(one_line(sentence))}.", is_problem=True)
         self._on_changed()
-        self.preview.tell("These files can't be learned from")
+        self.preview.tell("A model can't be learned from these files")
 
     def _on_read(self, summary: SourcesSummary) -> None:
         self._summary = summary

@@ -86,7 +86,7 @@ class BodiesPanel(QWidget):
         header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
         header.setSectionResizeMode(_NAME, QHeaderView.ResizeMode.Stretch)
         self.save = QPushButton("Save scene…")
-        self.save.setToolTip("Keep which files the scene is made of, and where they stand")
+        self.save.setToolTip("Save the scene: its files and their positions")
         self.save.clicked.connect(self.save_wanted)
         self.clip = QComboBox()
         self.clip.setToolTip("Which of its clips the chosen body plays")

@@ -570,11 +570,14 @@ class ProposalCard(Card):
             self._end()
             return
         then = proposed.n_colliding_then
-        remaining = f"{then} still would, elsewhere" if then else "none would"
+        remaining = "no pose collides"
+        if then:
+            verb = "collides" if then == 1 else "collide"
+            remaining = f"{counted(then, 'pose')} still {verb} elsewhere"
         self.text.setText(
             f"{proposed.n_colliding} of {counted(proposed.n_poses, 'pose')} collide, and the "
             f"same parts touch in nearly all of them. With "
-            f"{counted(len(proposed.new), 'such place')} not counted, {remaining}."
+            f"{counted(len(proposed.new), 'such place')} ignored, {remaining}."
         )
         lines = [
             f"{pair_in_words(pair)}: {counted(n, 'place')}" for pair, n in proposed.places.items()

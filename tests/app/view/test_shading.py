@@ -76,7 +76,7 @@ def test_an_unknown_energy_is_plain_and_says_so(shader: Shader) -> None:
         assert legend.note
         # The scale is shown before its numbers, so that the legend does not grow.
         assert legend.ramp
-    assert "does not predict" in shader.legend(Shading.PREDICTED, Known(), has_predictor=False).note
+    assert "no predictor" in shader.legend(Shading.PREDICTED, Known(), has_predictor=False).note
 
 
 def test_predicted_energy_is_spread_by_the_masks(shader: Shader) -> None:
@@ -114,7 +114,8 @@ def test_an_estimate_that_the_check_contradicts_says_so_in_its_legend(shader: Sh
     energy = np.array([1e-4, 0.0])
     assert "%" in shader.legend(Shading.PREDICTED, Known(energy)).note
     assert (
-        shader.legend(Shading.PREDICTED, Known(energy, np.zeros(4))).note == "the check found none"
+        shader.legend(Shading.PREDICTED, Known(energy, np.zeros(4))).note
+        == "no collisions (checked)"
     )
     assert "%" in shader.legend(Shading.PREDICTED, Known(energy, np.full(4, 1e-6))).note
 

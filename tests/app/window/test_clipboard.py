@@ -79,7 +79,7 @@ def test_a_pose_and_a_limb_of_it_are_pasted(window: MainWindow, body: RigBody) -
     np.testing.assert_array_equal(now, moved & ~locked)
     choose(window, vertex_of(body, "Left thigh"), "Paste into limb")
     (dialog,) = window.findChildren(FailureDialog)
-    assert "has nothing of this limb" in dialog.failure.headline
+    assert "has no values for this limb" in dialog.failure.headline
     dialog.close()
 
 

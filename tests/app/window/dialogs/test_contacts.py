@@ -285,7 +285,7 @@ def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
         for kind, pairs in expected.items()
         if pairs
     }
-    assert dialog.total.text().startswith(f"Begin with {min(left_out, key=left_out.__getitem__)}")
+    assert dialog.total.text().startswith(f"Start with {min(left_out, key=left_out.__getitem__)}")
     scene = window.viewport.scene
     assert scene is not None
     item = kinds[0].child(0)

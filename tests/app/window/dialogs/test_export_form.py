@@ -327,7 +327,7 @@ def test_clips_are_kept_beside_a_pose_of_joints_where_the_box_says_so(
     box = form.keep_clips
     assert box is not None
     assert not form.export_request.keep_clips
-    assert "Its clips are left out, as they would hide the pose." in form._about.text()
+    assert "Its clips are left out: a playing clip would hide the pose." in form._about.text()
     box.setChecked(True)
     assert form.export_request.keep_clips
     assert "Its clips stay;" in form._about.text()
