@@ -149,16 +149,15 @@ def score_contacts(
     for body in bodies:
         copied = moved_onto(body, source, motion)
         check, up = body.exact_check(), body.space.up
-        start = time.perf_counter()
-        none = np.zeros((len(copied), body.space.n_domains), dtype=np.bool_)
-        versions = {"copied": (copied, none, 0.0)}
+        standing = np.zeros((len(copied), body.space.n_domains), dtype=np.bool_)
+        versions = {"copied": (copied, 0.0)}
         for method, keeps in (("free", False), ("kept", True)):
             start = time.perf_counter()
             options = MotionOptions(keep_contacts=keeps)
             resolution = resolve_motion(body.resolver, copied, up, options, workers, job)
             seconds = time.perf_counter() - start
-            versions[method] = replace(resolution.motion, contacts=copied.contacts), none, seconds
-        for method, (moved, standing, seconds) in versions.items():
+            versions[method] = replace(resolution.motion, contacts=copied.contacts), seconds
+        for method, (moved, seconds) in versions.items():
             report = MotionReport.of(copied, moved, check, standing)
             contacts = contact_report(moved, check)
             assert contacts is not None

@@ -80,7 +80,7 @@ def time_predictor(
     import torch
 
     latent = drawn_poses(model, TABLE_POSES)
-    exact = _time_exact(model, latent[:n_poses], job or Job())
+    exact = _time_exact(model, latent[:n_poses], job)
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     return [
         _time_on(device, replace(predictor, device=device), latent, exact) | exact

@@ -309,8 +309,6 @@ def note_if_beside(written: Path, destination: Path) -> None:
 
 
 def _describe_predictor(model: Body) -> dict[str, Any] | None:
-    from dataclasses import asdict
-
     record = model.predictor_record
     if record is None:
         return None

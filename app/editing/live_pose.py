@@ -18,8 +18,6 @@ from lcollision_core.tasks.words import counted
 
 if TYPE_CHECKING:
     from app.editing.history import DocumentState
-    from app.work.frames import PoseFrame
-    from app.work.pose_worker import CodeTarget, GripTarget, MotionStart
     from lcollision_core.bodies import Body, NamedPose
     from lcollision_core.contact import NearestPair, SelfCollisions
     from lcollision_core.posing import Grip, Pin, Twist

@@ -600,17 +600,17 @@ class Viewport(QWidget):
             self._transition.begin(partial(_between_poses, visible_points, frame.vertices))
         else:
             scene.show(frame.vertices, frame.normals)
-            if before is not None and self.follows and moment != self._moment:
-                axis = self._document.model.up_axis
-                without_ground = self._document.model.without_ground
-                old, new = without_ground(before.vertices), without_ground(frame.vertices)
-                scene.view = followed(scene.view, old, new, axis, self._aspect)
-            if frame.latent is self._loaded and before is not None:
-                without_ground = self._document.model.without_ground
-                old, new = without_ground(before.vertices), without_ground(frame.vertices)
-                view = reframed_if_out_of_view(scene.view, old, new, self._aspect)
-                if view is not None:
-                    self._turn.begin(partial(interpolated, scene.view, view))
+            is_followed = self.follows and moment != self._moment
+            is_loaded = frame.latent is self._loaded
+            if before is not None and (is_followed or is_loaded):
+                model = self._document.model
+                old, new = (model.without_ground(one.vertices) for one in (before, frame))
+                if is_followed:
+                    scene.view = followed(scene.view, old, new, model.up_axis, self._aspect)
+                if is_loaded:
+                    view = reframed_if_out_of_view(scene.view, old, new, self._aspect)
+                    if view is not None:
+                        self._turn.begin(partial(interpolated, scene.view, view))
         self._transition_to = self._loaded = None
         self._moment = moment
         if self.shading is Shading.EXACT:

@@ -92,13 +92,12 @@ class BodyMenus(QObject):
         menu.entry("Pas&te into limb", paste_pose, document, vertex)
         mesh = self._window.meshes.mesh_at(vertex)
         if mesh is not None:
-            one_left = len(self._window.meshes.hidden) == len(self._window.meshes.meshes) - 1
             menu.entry(
                 f"&Hide {menu_text(mesh)}",
                 self._window.meshes.hide,
                 mesh,
                 tip="Neither drawn nor checked; View > Meshes shows it again",
-                enabled=not (one_left or document.tasks.changing_model),
+                enabled=self._window.meshes.can_hide,
             )
         sizes = self._submenu(menu, "Patch si&ze")
         for text, radius in _RADII.items():

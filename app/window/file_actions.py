@@ -18,6 +18,7 @@ from app.window.dialogs.forms import (
     MotionDialog,
     print_form,
     print_options,
+    run_form,
     screenshot_form,
     video_form,
 )
@@ -162,7 +163,7 @@ class FileActions(QObject):
     def _import_mesh(self, path: Path, is_asked: bool = True) -> None:
         self._require_model(path)
         self._document.tasks.import_mesh(path, is_asked_as_mesh=is_asked)
-        self.settings["last_folder"] = str(path.resolve().parent)
+        self._remember_folder(path)
 
     def why_not_upright(self) -> str:
         """Return why the body cannot be turned, "" if it can."""
@@ -224,7 +225,7 @@ class FileActions(QObject):
             MODEL_SUFFIX: document.tasks.open_model,
         }
         if suffix in SKELETON_SUFFIXES or is_smpl_motion(path) or is_generated(path):
-            self._open_motion(path)
+            self.open_motion(path)
             return
         if suffix in CHARACTER_SUFFIXES or (beside is not None and suffix in READABLE_SUFFIXES):
             opened = partial(self._open_examined, path, beside)
@@ -247,7 +248,7 @@ class FileActions(QObject):
             if suffix == POSES_SUFFIX:
                 self._require_model(path)
             openers[suffix](path)
-            self.settings["last_folder"] = str(path.resolve().parent)
+            self._remember_folder(path)
 
     def _require_model(self, path: Path) -> None:
         if not self._document.has_model:
@@ -257,7 +258,8 @@ class FileActions(QObject):
                 where=path.name,
             )
 
-    def _open_motion(self, path: Path) -> None:
+    def open_motion(self, path: Path) -> None:
+        """Open a motion of the open body on the timeline, after asking about unsaved changes."""
         self._require_model(path)
         if self.confirm_losing_changes(with_library=False):
             self._document.timeline.open(path)
@@ -265,7 +267,7 @@ class FileActions(QObject):
     def _open_examined(self, path: Path, beside: Body | None, read: FileContent) -> None:
         """Open an examined file: as a body if rigged, else as a motion or mesh of the open one."""
         if isinstance(read, AnimationAlone):
-            self._attempt(partial(self._open_motion, path))
+            self._attempt(partial(self.open_motion, path))
             return
         if beside is not None and read is not None and not beside.is_of_file(path):
             answer = ask_to_join(self._window, path.name, beside.name)
@@ -278,7 +280,7 @@ class FileActions(QObject):
             self._attempt(partial(self._import_mesh, path, is_asked=is_asked))
         elif self._attempt(self.confirm_losing_changes):
             self._document.tasks.open_model(path, read)
-            self.settings["last_folder"] = str(path.resolve().parent)
+            self._remember_folder(path)
 
     def open_dropped(self, paths: Sequence[Path]) -> None:
         """Open the first supported file of several, and report the others afterwards.
@@ -423,9 +425,8 @@ class FileActions(QObject):
             exporting.export, document.model, state.pose, state.outcome, own=frame_space
         )
         form = ExportDialog(self.settings, self._window, document.model)
-        accepted = form.exec() == QDialog.DialogCode.Accepted
+        accepted = run_form(form)
         kinds, style = form.kinds, form.export_request
-        form.deleteLater()
         path = self.ask_save("Export mesh", self._name, kinds) if accepted else None
         if path is not None:
             document.tasks.write(f"Exporting {path.name}", partial(export, path, style))
@@ -438,8 +439,7 @@ class FileActions(QObject):
         model, state = document.model, document.history.state
         resolve = document.tasks.resolve_options() if model.can_resolve else None
         form = print_form(self.settings, self._window)
-        accepted = form.exec() == QDialog.DialogCode.Accepted
-        form.deleteLater()
+        accepted = run_form(form)
         kinds = {FILES[suffix].label: suffix for suffix in PRINT_SUFFIXES}
         path = self.ask_save("Export for 3D printing", self._name, kinds) if accepted else None
         if path is not None:
@@ -473,10 +473,9 @@ class FileActions(QObject):
         if scene is not None:
             return self._export_scene_motion(scene, motion)
         form = MotionDialog(self.settings, self._window, model, motion.rate, timeline)
-        accepted = form.exec() == QDialog.DialogCode.Accepted
+        accepted = run_form(form)
         kinds, request, frames = form.kinds, form.export_request, form.frames
         is_clip = form.is_clip
-        form.deleteLater()
         own_suffix = file.suffix.lower()
         is_own_smpl = is_smpl_motion(file) and timeline.joints is None
         if is_own_smpl:
@@ -603,8 +602,7 @@ class FileActions(QObject):
 
     def _ask_save_after(self, form: QDialog, title: str, kinds: dict[str, str]) -> Path | None:
         """Show a form, then ask for a file to write; a turntable's format is listed first."""
-        accepted = form.exec() == QDialog.DialogCode.Accepted
-        form.deleteLater()
+        accepted = run_form(form)
         first = f".{self.settings['turntable_format']}"
         kinds = dict(sorted(kinds.items(), key=lambda kind: kind[1] != first))
         return self.ask_save(title, self._name, kinds) if accepted else None
@@ -731,6 +729,9 @@ class FileActions(QObject):
         if ask_about_scale(self._window, path.name, found):
             self._document.tasks.import_mesh(path, found.factor)
 
+    def _remember_folder(self, path: Path) -> None:
+        self.settings["last_folder"] = str(path.resolve().parent)
+
     def _folder(self) -> Path:
         folder = Path(self.settings["last_folder"] or Path.home())
         return folder if folder.is_dir() else Path.home()
@@ -791,7 +792,7 @@ class FileActions(QObject):
                     path = None
         dialog.deleteLater()
         if path is not None:
-            self.settings["last_folder"] = str(path.resolve().parent)
+            self._remember_folder(path)
         return path
 
 

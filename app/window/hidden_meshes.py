@@ -84,6 +84,12 @@ class HiddenMeshes(QObject):
             (group.name for group in self.meshes if (faces[group.faces] == vertex).any()), None
         )
 
+    @property
+    def can_hide(self) -> bool:
+        """Whether another mesh can be hidden: one stays visible, and rules change one at a time."""
+        has_two_visible = len(self.hidden) < len(self.meshes) - 1
+        return has_two_visible and not self._document.tasks.changing_model
+
     def hide(self, name: str, hidden: bool = True) -> None:
         """Hide a mesh and exclude it from the check, or show it and check it again."""
         model, key = self._document.model, self._key(name)
@@ -117,8 +123,6 @@ class HiddenMeshes(QObject):
         hidden = self.hidden
         for group in self.meshes:
             is_hidden = group.name in hidden
-            # Keep one mesh visible, and change the rules once at a time.
-            is_last = not is_hidden and len(hidden) == len(self.meshes) - 1
             self.menu.entry(
                 menu_text(group.name),
                 self.hide,
@@ -126,5 +130,5 @@ class HiddenMeshes(QObject):
                 not is_hidden,
                 tip=_SHOWN,
                 ticked=not is_hidden,
-                enabled=not (is_last or self._document.tasks.changing_model),
+                enabled=self.can_hide or (is_hidden and not self._document.tasks.changing_model),
             )

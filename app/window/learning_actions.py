@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QDialog, QStatusBar, QToolButton, QWidget
 from app.window.dialogs.learning import STAGE_WORDS, LearningDialog
 from app.window.dialogs.new_model import NewModelDialog
 from app.window.file_actions import FileActions
-from app.window.widgets import plain_tip
+from app.window.widgets import plain_tip, restyle
 from app.work import learning_jobs
 from app.work.learning_runs import LearningRun, LearningRuns
 from app.work.long_work import LongWork
@@ -187,8 +187,7 @@ class LearningActions(QObject):
             state = "failed" if failed else "done" if run.state == RunState.DONE else ""
             if self.indicator.property("state") != state:
                 self.indicator.setProperty("state", state)
-                self.indicator.style().unpolish(self.indicator)
-                self.indicator.style().polish(self.indicator)
+                restyle(self.indicator)
         for learning_run in self.runs.runs:
             is_new = (
                 learning_run.state == RunState.DONE

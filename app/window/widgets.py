@@ -597,8 +597,13 @@ def show_verdict(widget: QWidget, verdict: str) -> None:
     """Style a widget as "free", "colliding", "waiting" or, beside a checked result, "aside"."""
     if widget.property("verdict") != verdict:
         widget.setProperty("verdict", verdict)
-        widget.style().unpolish(widget)
-        widget.style().polish(widget)
+        restyle(widget)
+
+
+def restyle(widget: QWidget) -> None:
+    """Apply the style sheet again after a property or the object name of a widget has changed."""
+    widget.style().unpolish(widget)
+    widget.style().polish(widget)
 
 
 def scrolling(page: QWidget) -> QScrollArea:

@@ -124,7 +124,8 @@ def read_lost(
     -------
     read, motions : the motions are None if there are none, or the Failure that lost them
     """
-    opened = _opened_in_shape(model, model_file, path, job)
+    stored = _stored_motions(path)
+    opened = _opened_in_shape(model, model_file, stored, job)
     if opened is not None:
         model = opened.model
     read = open_poses_to_show(model, model_file, path, job)
@@ -134,28 +135,33 @@ def read_lost(
     if body is None or isinstance(read, LCollisionError):
         return read, None
     try:
-        return read, _motions(body, path, job)
+        return read, _motions(body, stored, job)
     except LCollisionError as error:
         return read, Failure.of(error)
 
 
-def _opened_in_shape(
-    model: Body | None,
-    model_file: str,
-    path: Path,
-    job: Job,
-) -> OpenedModel | None:
-    """Return the body in the shape that the kept motion's file gives; None if it gives none."""
-    from lcollision_core.bodies.motions import body_of_motion
+def _stored_motions(path: Path) -> Any:
+    """Return what a file of poses stores of the motions; None if it stores none or is damaged."""
     from lcollision_core.bodies.poses import MAX_FILE_BYTES
-    from lcollision_core.files.motion.smpl_motion import is_smpl_motion
 
     try:
         document = parse_json(read_regular(path, MAX_FILE_BYTES))
     except (OSError, ValueError):
         # Reading the poses reports it.
         return None
-    stored = document.get(KEY) if isinstance(document, dict) else None
+    return document.get(KEY) if isinstance(document, dict) else None
+
+
+def _opened_in_shape(
+    model: Body | None,
+    model_file: str,
+    stored: Any,
+    job: Job,
+) -> OpenedModel | None:
+    """Return the body in the shape that the kept motion's file gives; None if it gives none."""
+    from lcollision_core.bodies.motions import body_of_motion
+    from lcollision_core.files.motion.smpl_motion import is_smpl_motion
+
     file = stored.get("file") if isinstance(stored, dict) else None
     if not isinstance(file, str) or not is_smpl_motion(file):
         return None
@@ -163,10 +169,7 @@ def _opened_in_shape(
     return OpenedModel(body_of_motion(body, Path(file))[0], model_file)
 
 
-def _motions(body: Body, path: Path, job: Job) -> EditedMotions | None:
-    from lcollision_core.bodies.poses import MAX_FILE_BYTES
-
-    document = parse_json(read_regular(path, MAX_FILE_BYTES)).get(KEY)
+def _motions(body: Body, document: Any, job: Job) -> EditedMotions | None:
     if document is None:
         return None
     try:

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QDialog
 
 from app.editing.history import Source
 from app.editing.library import retagged
 from app.editing.tasks import Work
 from app.window.command import EditorWindow, Menu, called, greyed, unless
-from app.window.dialogs.forms import MotionDialog
+from app.window.dialogs.forms import MotionDialog, run_form
 from app.window.dialogs.questions import ask_for_name, ask_to_replace
 from app.work.long_work import as_task
 from lcollision_core.tasks.editing import save_poses
@@ -277,9 +276,8 @@ def _export_motion(window: EditorWindow) -> None:
 
     model, poses = window.document.model, window.library.chosen_poses
     form = MotionDialog(window.settings, window, model)
-    accepted = form.exec() == QDialog.DialogCode.Accepted
+    accepted = run_form(form)
     kinds, style = form.kinds, form.export_request
-    form.deleteLater()
     path = window.files.ask_save("Export motion", poses[0].name, kinds) if accepted else None
     if path is not None:
         codes = np.array([pose.latent for pose in poses])

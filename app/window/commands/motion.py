@@ -54,8 +54,8 @@ def _why_not_filmed(window: EditorWindow) -> str:
 )
 def _open(window: EditorWindow) -> None:
     path = window.files.ask_open("Open motion", "motion")
-    if path is not None and window.files.confirm_losing_changes(with_library=False):
-        _timeline(window).open(path)
+    if path is not None:
+        window.files.open_motion(path)
 
 
 @MOTION.command(

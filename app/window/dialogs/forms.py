@@ -621,6 +621,16 @@ def _back_as(source: Path | None, form: ExportForm | None) -> str:
     )
 
 
+def run_form(form: QDialog) -> bool:
+    """Show a form until it is closed; return whether it was accepted.
+
+    The form is deleted once the caller returns to the event loop; read its fields before.
+    """
+    is_accepted = form.exec() == QDialog.DialogCode.Accepted
+    form.deleteLater()
+    return is_accepted
+
+
 def _meanings(model: Body) -> dict[str, str]:
     """Return explanations of the axis presets for a body."""
     from lcollision_core.bodies import ExportAxes

@@ -29,6 +29,7 @@ from app.window.widgets import (
     dialog_vbox,
     hbox,
     labelled,
+    restyle,
     screen_of,
     swatch_icon,
     vbox,
@@ -341,8 +342,7 @@ class _StageRows(Card):
             icon = ("check", "free") if is_done else ("right", "accent" if is_now else "track")
             sign.show_icon(*icon)
             name.setObjectName("title" if is_now else "" if is_done else "caption")
-            name.style().unpolish(name)
-            name.style().polish(name)
+            restyle(name)
             seconds = run.status.seconds.get(stage, 0.0)
             text = spent_text(seconds) if seconds >= 1.0 else ""
             if is_now and run.status.stage_done > 0.0:

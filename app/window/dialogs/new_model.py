@@ -42,6 +42,7 @@ from app.window.widgets import (
     hbox,
     labelled,
     plain_tip,
+    restyle,
     screen_of,
     scrolling,
     vbox,
@@ -182,8 +183,7 @@ class FilesPage(Page):
         self._problem = text if is_problem else ""
         self.found.setObjectName("refusal" if is_problem else "caption")
         self.found.setText(text)
-        self.found.style().unpolish(self.found)
-        self.found.style().polish(self.found)
+        restyle(self.found)
 
     def show_summary(self, summary: SourcesSummary) -> None:
         """Show the notes on what was found, and what was changed on reading."""
@@ -390,7 +390,7 @@ class ContactsPage(Page):
             rule.field for rule in (self._near, self._rest, self._tolerated)
         )
         self.count_groups = QCheckBox("Count them anyway")
-        self._groups = _plain(
+        self._groups = _ExplainedCard(
             "Pieces that always touch",
             "Hair on a head, a shoe on a foot: pairs of pieces in contact in nearly every pose.",
         )
@@ -524,15 +524,22 @@ class QualityPage(Page):
         return self._why_no_name(self.name.text().strip())
 
 
-class _Rule(Card):
+class _ExplainedCard(Card):
+    """A card with a title and an explanation."""
+
+    def __init__(self, title: str, about: str) -> None:
+        super().__init__()
+        self.column.addWidget(labelled(title, "title"))
+        self.column.addWidget(labelled(about, "caption", wraps=True))
+
+
+class _Rule(_ExplainedCard):
     """A rule in plain words, with an optional length for experts."""
 
     def __init__(
         self, title: str, about: str, most: float, default: float, words: str = "Within"
     ) -> None:
-        super().__init__()
-        self.column.addWidget(labelled(title, "title"))
-        self.column.addWidget(labelled(about, "caption", wraps=True))
+        super().__init__(title, about)
         self.own, self.field = QCheckBox(words), NumberBox(2, 0.0, most)
         self.field.setSuffix(" % of the body size")
         self.field.setSingleStep(0.5)
@@ -546,13 +553,6 @@ class _Rule(Card):
     def value(self) -> float | None:
         """Return the normalised length, None if its box is not ticked."""
         return self.field.value() / _PERCENT if self.own.isChecked() else None
-
-
-def _plain(title: str, about: str) -> Card:
-    card = Card()
-    card.column.addWidget(labelled(title, "title"))
-    card.column.addWidget(labelled(about, "caption", wraps=True))
-    return card
 
 
 def _held(layout: Any) -> QWidget:
@@ -808,5 +808,4 @@ def _facts(summary: SourcesSummary) -> str:
 def _mark(label: QLabel, place: str) -> None:
     """Style the label of a step as "done", "here" or "later"."""
     label.setObjectName("title" if place == "here" else "" if place == "done" else "caption")
-    label.style().unpolish(label)
-    label.style().polish(label)
+    restyle(label)
