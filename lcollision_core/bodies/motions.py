@@ -271,7 +271,10 @@ def read_motions(
         raise MeshFileError("has no clips to choose from", "leave out the clip", where=path)
     if is_retargeted(body, path):
         return [
-            replace(motion, contacts=_contacts(body, path, motion, retargeting, fps))
+            replace(
+                _with_weights(body, path, motion, fps),
+                contacts=_contacts(body, path, motion, retargeting, fps),
+            )
             for motion, retargeting in retargeted_motions(body, path, clip, fps)
         ]
     if is_smpl_motion(path):
@@ -316,20 +319,42 @@ def _contacts(
 
     @cache
     def found() -> KeptContacts | None:
-        document = open_rigged(path)
-        if document is None:
+        source = _source_of(path)
+        if source is None:
             return None
-        try:
-            source = open_body(document)
-        except LCollisionError:
-            # The motion only needs the skeleton, which could be read.
-            return None
-        if source.character is None or source.joints is None:
-            return None
-        source_motion = _of_clip(source.character, source.joints, motion.name, fps)
+        source_motion = _of_clip(source.character, source.space, motion.name, fps)
         return contacts_of(body, motion, source, source_motion, retargeting)
 
     return found
+
+
+def _source_of(path: Path) -> RigBody | None:
+    """Return the character of a file whose clips move another; None without a readable skin."""
+    document = open_rigged(path)
+    if document is None:
+        return None
+    try:
+        source = open_body(document)
+    except LCollisionError:
+        # The motion only needs the skeleton, which could be read.
+        return None
+    return source if isinstance(source, RigBody) else None
+
+
+def _with_weights(body: Body, path: Path, motion: Motion, fps: float | None) -> Motion:
+    """Return a retargeted motion with the weights of sliders that both bodies name alike."""
+    source = _source_of(path) if body.shape_names else None
+    names = [] if source is None else [n for n in body.shape_names if n in source.shape_names]
+    if source is None or not names:
+        return motion
+    clip, codes = _of_clip(source.character, source.space, motion.name, fps), motion.codes.copy()
+    for name in names:
+        own, theirs = (
+            one.shape_codes.start + one.shape_names.index(name) for one in (body, source)
+        )
+        since = clip.times - clip.times[0]
+        codes[:, own] = np.interp(motion.times, since, clip.codes[:, theirs])
+    return replace(motion, codes=codes)
 
 
 def is_of_skeleton(path: Path) -> bool:

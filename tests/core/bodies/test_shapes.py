@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from lcollision_core.posing import DragOptions, Grip, PoseDragger
 from tests.core.fbx_builder import arm_fbx
 from tests.core.gltf_builder import arm, split_corners, tube
 from tests.rigged_shapes import rigged_body
+from tests.small_models import SHAPED
 
 _NAMES = "smile_L", "smile_R", "fat"
 _CLIP = "wave"
@@ -145,6 +147,20 @@ def test_clips_play_with_their_weights(body: RigBody) -> None:
     frames = body.character.sample(_CLIP, 10.0)
     np.testing.assert_allclose(body.decode(motion.codes), frames.vertices, atol=1e-6)
     assert np.ptp(motion.codes[:, -3:], axis=0).min() > 0.4
+
+
+def test_a_clip_of_another_character_brings_its_weights(tmp_path: Path) -> None:
+    source = RigBody.of(read_character(SHAPED[1]))
+    rig = source.space.rig
+    names = tuple(f"{name}2" if name == "Head" else name for name in rig.joint_names)
+    assert names != rig.joint_names
+    body = RigBody.of(replace(source.character, rig=replace(rig, joint_names=names)))
+    clip = Path(shutil.copy(SHAPED[1], tmp_path / "other.glb"))
+    for own, carried in zip(read_motions(source, SHAPED[1]), read_motions(body, clip), strict=True):
+        np.testing.assert_allclose(
+            carried.codes[:, body.shape_codes], own.codes[:, source.shape_codes], atol=1e-6
+        )
+        assert carried.codes[:, body.shape_codes].min() > 0.9
 
 
 def test_solvers_leave_shapes_as_they_are_posed(body: RigBody) -> None:
