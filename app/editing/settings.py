@@ -65,6 +65,7 @@ SETTINGS: dict[str, Setting] = {
     "resolve_time_budget": Setting(20.0, 0.1, 3600.0),
     "export_form": Setting("joints", choices=("joints", "mesh", "morph", "obj", "mesh-alone")),
     "export_keep_clips": Setting(False),
+    "scene_form": Setting("own", choices=("own", "obj", "ply", "stl", "glb")),
     "motion_form": Setting("clip", choices=("clip", "bvh", "vrma", "pc2", "mdd")),
     "export_rate": Setting(30.0, 0.001, 240.0),
     "export_axes": Setting("model", choices=("model", "y-up", "blender", "maya", "unreal")),

@@ -191,6 +191,7 @@ class Viewport(QWidget):
         self.shading, self.follows = Shading.PLAIN, True
         self._moment: tuple[str, int] | None = None
         self._highlight: int | None = None
+        self._hidden: npt.NDArray[np.bool_] | None = None
         self.hovered_domain: int | None = None
         self.canvas: Canvas | None = None
         self.mouse: Mouse | None = None
@@ -324,6 +325,7 @@ class Viewport(QWidget):
 
     def hide_faces(self, hidden: npt.NDArray[np.bool_] | None) -> None:
         """Hide faces, a (F,) bool array or None, until another model is opened."""
+        self._hidden = hidden
         if self.scene is not None:
             self.scene.hide_faces(hidden)
             self._recolour(crossing=True)
@@ -464,6 +466,9 @@ class Viewport(QWidget):
             is_same = self._model is not None and self._model.topology is model.topology
             view = self.scene.view if is_same else None
         self.scene = Scene(self.canvas, model, current_theme())
+        if self._hidden is not None and len(self._hidden) == model.topology.n_faces:
+            # Chosen before there was a scene, as of a body that is open from the start.
+            self.scene.hide_faces(self._hidden)
         self._model = model
         self._legend.set_legend(Legend())
         self._shader = self._new_shader()

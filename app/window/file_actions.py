@@ -16,6 +16,7 @@ from app.editing.history import Source, named_after
 from app.window.dialogs.forms import (
     ExportDialog,
     MotionDialog,
+    SceneExportDialog,
     print_form,
     print_options,
     run_form,
@@ -412,10 +413,16 @@ class FileActions(QObject):
         document = self._document
         scene = as_scene(document.model)
         if scene is not None:
-            folder = self._ask_folder_of_bodies(scene, of_motion=False)
+            pose, bodies = (
+                document.history.pose,
+                SceneExportDialog(self.settings, self._window, scene),
+            )
+            accepted = bodies.exec() == QDialog.DialogCode.Accepted
+            request = bodies.export_request
+            bodies.deleteLater()
+            folder = self._ask_folder_of_bodies(scene, request.mesh_format) if accepted else None
             if folder is not None:
-                pose = document.history.pose
-                work = partial(scenes.export_scene_pose, folder, scene, pose)
+                work = partial(scenes.export_scene_pose, folder, scene, pose, request)
                 document.tasks.write(f"Exporting {folder.name}", work)
             return
         # Capture the model and pose now: others may be opened while the dialogs are shown.
@@ -517,7 +524,9 @@ class FileActions(QObject):
         document.tasks.write(f"Exporting {folder.name}", work, done)
         return True
 
-    def _ask_folder_of_bodies(self, scene: SceneBody, *, of_motion: bool) -> Path | None:
+    def _ask_folder_of_bodies(
+        self, scene: SceneBody, mesh_format: str | None = None, *, of_motion: bool = False
+    ) -> Path | None:
         """Ask for a folder to write each body of a scene to; None if the user cancels.
 
         Raises
@@ -530,7 +539,7 @@ class FileActions(QObject):
         folder = QFileDialog.getExistingDirectory(self._window, title, start)
         if not folder:
             return None
-        files = files_of_members(Path(folder), scene, of_motion=of_motion)
+        files = files_of_members(Path(folder), scene, mesh_format, of_motion=of_motion)
         there = [file for file in files if file.exists()]
         if there and not ask_to_replace_files(self._window, there):
             return None

@@ -502,26 +502,30 @@ def playing(scene: SceneFile, number: int, clip: str, start: float) -> SceneFile
     return replace(scene, bodies=tuple(parts))
 
 
-def files_of_members(folder: Path, body: SceneBody, *, of_motion: bool) -> list[Path]:
+def files_of_members(
+    folder: Path, body: SceneBody, mesh_format: str | None = None, *, of_motion: bool
+) -> list[Path]:
     """Return the files that an export of a scene writes, one or two per body.
 
     Raises
     ------
     LCollisionError : one of them is a source file of the scene.
     """
-    files = [folder / file for _, file in written_members(body)]
+    files = [folder / file for _, file in written_members(body, mesh_format)]
     if of_motion:
         files += [file.with_suffix(".pc2") for file in files]
     refuse_to_replace(files, source_files(body), in_place=False)
     return files
 
 
-def export_scene_pose(folder: Path, body: SceneBody, pose: NamedPose, job: Job) -> str:
+def export_scene_pose(
+    folder: Path, body: SceneBody, pose: NamedPose, request: ExportRequest, job: Job
+) -> str:
     """Write a pose of a scene, each body to its own file; return a sentence for the status bar."""
     from lcollision_core.tasks.members import write_members
 
     vertices = body.exported_vertices(pose.latent, pose.placement)
-    write_members(folder, body, [pose], [vertices], ExportRequest(), job)
+    write_members(folder, body, [pose], [vertices], request, job)
     return say("Exported each body to {folder}", folder=folder.name)
 
 

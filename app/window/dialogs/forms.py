@@ -477,6 +477,42 @@ class ExportDialog(_FrameForm):
         self.explain(self._meaning, meaning if has_axes else _GLB if back else _STAY)
 
 
+class SceneExportDialog(_FrameForm):
+    """Ask for the format, the axes and the unit of the files of a scene's bodies.
+
+    Parameters
+    ----------
+    settings, parent : see `Form`
+    scene : of the pose
+    """
+
+    def __init__(self, settings: Settings, parent: QWidget, scene: Body) -> None:
+        super().__init__("Export each body", "Choose folder…", settings, parent)
+        formats = {suffix.removeprefix("."): name for name, suffix in _MESHES.items()}
+        formats = {"own": "The body's own file", **formats}
+        self.form = self.add_choice("scene_form", "Format", formats, "What is written of each body")
+        self.axes, self._scale = self._add_frame(scene)
+        self._about = self.add_note("")
+        self.form.currentIndexChanged.connect(self._explain)
+        self._explain()
+
+    @property
+    def export_request(self) -> ExportRequest:
+        """The export options in the fields."""
+        form = self.form.currentData()
+        if form == "own":
+            return ExportRequest()
+        return ExportRequest(self.axes.currentData(), self._scale.value(), mesh_format=form)
+
+    @Slot()
+    def _explain(self) -> None:
+        form = self.form.currentData()
+        for field in (self.axes, self._scale):
+            field.setEnabled(form not in ("own", "glb"))
+        own = "Each file keeps its textures, rig, axes and unit. "
+        self._about.setText(own if form == "own" else _GLB if form == "glb" else _FOLLOWS)
+
+
 class MotionDialog(_FrameForm):
     """Ask for the export form, the frame rate, the axes and the unit of frames.
 

@@ -22,6 +22,7 @@ from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.forms import (
     ExportDialog,
     MotionDialog,
+    SceneExportDialog,
     resolve_form,
     screenshot_form,
     video_form,
@@ -59,6 +60,7 @@ SHOWN: dict[str, Callable[[MainWindow], QDialog]] = {
     "turntable": lambda w: video_form(w.settings, w),
     "resolve": lambda w: resolve_form(w.settings, w),
     "export": lambda w: ExportDialog(w.settings, w, w.document.model),
+    "scene": lambda w: SceneExportDialog(w.settings, w, w.document.model),
     "motion": lambda w: MotionDialog(w.settings, w, w.document.model, 30.0),
     "parts": lambda w: BodyPartsDialog(w.document.model, True, w),
     "failure": lambda w: FailureDialog(Failure("no such file", "look elsewhere", "x"), w),

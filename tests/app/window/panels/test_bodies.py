@@ -15,6 +15,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.window import file_actions
+from app.window.dialogs.forms import SceneExportDialog
 from app.window.dialogs.questions import ask_to_join
 from app.window.main_window import MainWindow
 from app.window.widgets import NameLabel
@@ -136,6 +137,7 @@ def test_clips_of_a_scene_play_together_with_offsets_and_each_body_gets_its_file
     out = tmp_path / "out"
     out.mkdir()
     monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: str(out))
+    monkeypatch.setattr(SceneExportDialog, "exec", lambda _: QDialog.DialogCode.Accepted)
     for export in (window.files.export, window.files.export_motion):
         with qtbot.waitSignal(
             document.message, timeout=PATIENCE, check_params_cb=lambda told: "each body" in told
@@ -145,6 +147,13 @@ def test_clips_of_a_scene_play_together_with_offsets_and_each_body_gets_its_file
         for one in out.iterdir():
             assert open_body(one).n_vertices == open_body(moving).n_vertices
             one.unlink()
+    window.settings["scene_form"], window.settings["export_axes"] = "obj", "blender"
+    told = "each body"
+    with qtbot.waitSignal(
+        document.message, timeout=PATIENCE, check_params_cb=lambda text: told in text
+    ):
+        window.files.export()
+    assert sorted(one.name for one in out.iterdir()) == ["moving 2.obj", "moving.obj"]
     close_window(window)
 
 
