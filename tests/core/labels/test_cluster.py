@@ -119,7 +119,7 @@ def test_workers_that_come_late_are_asked_for_their_version(
                 client.run(change, "0.0.7", workers=[worker])
 
         try:
-            with pytest.raises(LCollisionError, match=f"{worker} has lcollision 0.0.7, this is"):
+            with pytest.raises(LCollisionError, match=f"{worker} runs lcollision 0.0.7, but"):
                 label_poses(
                     labeller,
                     tmp_path / "store",

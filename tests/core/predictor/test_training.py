@@ -471,7 +471,7 @@ def test_rows_that_cannot_teach_are_refused(tube_model: LearnedBody, rows: Label
     energy, latent = rows.energy.copy(), rows.latent.copy()
     energy[11], latent[17, 2] = np.nan, np.inf
     for broken, row in ((replace(rows, energy=energy), 11), (replace(rows, latent=latent), 17)):
-        with pytest.raises(ShapeError, match=rf"row {row} \(from 0\) has a number that is not fin"):
+        with pytest.raises(ShapeError, match=rf"row {row} \(from 0\) contains NaN or inf"):
             train_predictor(broken, embedding, config())
     foreign = replace(rows, latent=rows.latent[:, :-1])
     size = embedding.latent_size
