@@ -81,8 +81,11 @@ class _Loop:
     def _made(self) -> Any:
         with _making:
             try:
-                return _numba().njit(cache=self._cache, **self._options)(self.py_func)
-            except RuntimeError:
+                made = _numba().njit(cache=self._cache, **self._options)(self.py_func)
+                if self._cache:
+                    _forget_unreadable(made._cache)
+                return made
+            except (RuntimeError, OSError):
                 # Neither the installation nor the user's cache folder is writable, as for a service
                 # account without a home. Start slowly every time rather than not at all.
                 return _numba().njit(**self._options)(self.py_func)
@@ -93,6 +96,17 @@ class _Loop:
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of what numba has made, which other loops that call this one need."""
         return getattr(self._made, name)
+
+
+def _forget_unreadable(cache: Any) -> None:
+    """Empty a cache of another release, if it names classes that are gone.
+
+    Numba unpickles an index before it compares the date of the source.
+    """
+    try:
+        cache._cache_file._load_index()
+    except (AttributeError, ImportError):
+        cache.flush()
 
 
 _making = threading.Lock()

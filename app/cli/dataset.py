@@ -269,7 +269,8 @@ def _gathered(
         note(remark)
     if by_rig is not None:
         drawn = poses.provenance["sources"][-1]["by_rig"]
-        note(f"{drawn['free']} of {counted(drawn['drawn'], 'pose')} by the rig are free")
+        n_drawn = counted(drawn["drawn"], "pose")
+        note(f"{drawn['free']} of {n_drawn} by the rig are free of collisions")
     if not (guess := poses.up).is_sure:
         note(f"{up_sentence(guess)}; --up x|y|z overrides it")
     return poses

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import pickle
 import time
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import numba
 import numpy as np
 import pytest
 
@@ -74,3 +76,14 @@ def test_a_loop_runs_where_nothing_can_be_cached(
     for variable in ("HOME", "XDG_CACHE_HOME", "LOCALAPPDATA"):
         monkeypatch.setenv(variable, str(tmp_path / "__pycache__"))
     assert _module(tmp_path).triangular(4) == 10
+
+
+def test_a_cache_that_names_a_class_of_an_earlier_release_is_made_anew(tmp_path: Path) -> None:
+    assert _module(tmp_path).triangular(4) == 10
+    (index,) = tmp_path.glob("__pycache__/loops.triangular-*.nbi")
+    whole = index.read_bytes()
+    gone = b"clcollision_core.compiled\nGone\n."
+    index.write_bytes(pickle.dumps(numba.__version__) + gone)
+    assert _module(tmp_path).triangular(4) == 10
+    assert gone not in index.read_bytes()
+    assert len(index.read_bytes()) > len(whole) // 2
