@@ -19,13 +19,12 @@ from .operators import (
     LEAST_CHANGE,
     LEVELS,
     MOST_STEPS,
-    array,
     is_worse,
     open_character,
     turning,
     where,
 )
-from .results import MARKER, Shown, clear, clear_frames
+from .results import MARKER, Shown, array, clear, clear_frames
 from .scene import OFF_RIG, Caution, Rigged, SceneError
 from .steps import ModalOperator
 
@@ -893,14 +892,4 @@ def _free_name(name: str) -> str:
 
 _CLASSES = (LCOLLISION_OT_check_action, LCOLLISION_OT_resolve_action)
 
-
-def register() -> None:
-    """Add the operators."""
-    for one in _CLASSES:
-        bpy.utils.register_class(one)
-
-
-def unregister() -> None:
-    """Remove the operators."""
-    for one in reversed(_CLASSES):
-        bpy.utils.unregister_class(one)
+register, unregister = bpy.utils.register_classes_factory(_CLASSES)

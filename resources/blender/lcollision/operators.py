@@ -9,7 +9,7 @@ import numpy as np
 from . import results
 from .keys import check_keyable, unkeyable_bones
 from .link import OpenCharacter, Steps, open_steps, wait_for
-from .results import Shown
+from .results import Shown, array
 from .scene import Caution, Rigged, SceneError
 from .steps import ModalOperator
 
@@ -24,11 +24,6 @@ MOST_STEPS, _MOST_NAMED = 10, 3
 
 _ROUNDING = 1e-6
 """Difference of depths, in body sizes, that counts as rounding."""
-
-
-def array(values: dict) -> np.ndarray:
-    """Return an array from the engine's answer."""
-    return np.frombuffer(values["data"], values["dtype"]).reshape(values["shape"])
 
 
 def is_worse(after: dict, before: dict) -> bool:
@@ -297,14 +292,4 @@ def _rest(rigged: Rigged, reply: dict) -> str:
 
 _CLASSES = (LCOLLISION_OT_check_pose, LCOLLISION_OT_resolve_pose)
 
-
-def register() -> None:
-    """Add the operators."""
-    for one in _CLASSES:
-        bpy.utils.register_class(one)
-
-
-def unregister() -> None:
-    """Remove the operators."""
-    for one in reversed(_CLASSES):
-        bpy.utils.unregister_class(one)
+register, unregister = bpy.utils.register_classes_factory(_CLASSES)

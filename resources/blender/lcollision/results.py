@@ -69,10 +69,10 @@ def show(rigged: Rigged, reply: dict, shown: Shown) -> None:
     """Show the result of a check of `shown`, in the panel and over the mesh."""
     global _reply
     _say(rigged, reply)
-    pairs = _array(reply["faces"]).reshape(-1, 2)
+    pairs = array(reply["faces"]).reshape(-1, 2)
     deepest = np.zeros(max(len(rigged.triangles()), pairs.max(initial=-1) + 1))
     for faces in pairs.T:
-        np.maximum.at(deepest, faces, _array(reply["depths"]))
+        np.maximum.at(deepest, faces, array(reply["depths"]))
     chosen = np.unique(pairs)
     tint(rigged, chosen, drawing.by_depth(deepest[chosen]), shown)
     if _shown is not None:
@@ -157,8 +157,9 @@ def _on_load(*_: object) -> None:
     clear()
 
 
-def _array(values: dict) -> np.ndarray:
-    return np.frombuffer(values["data"], values["dtype"])
+def array(values: dict) -> np.ndarray:
+    """Return an array from the engine's answer."""
+    return np.frombuffer(values["data"], values["dtype"]).reshape(values["shape"])
 
 
 class LCOLLISION_OT_clear(bpy.types.Operator):

@@ -9,8 +9,8 @@ import numpy as np
 from . import drawing, results
 from .actions import action_of, frame_range
 from .link import Steps, wait_for
-from .operators import array, counted, open_character
-from .results import Shown
+from .operators import counted, open_character
+from .results import Shown, array
 from .scene import Rigged
 from .steps import ModalOperator
 
@@ -141,14 +141,4 @@ _CLASSES = (
     LCOLLISION_OT_count_places,
 )
 
-
-def register() -> None:
-    """Add the operators."""
-    for one in _CLASSES:
-        bpy.utils.register_class(one)
-
-
-def unregister() -> None:
-    """Remove the operators."""
-    for one in reversed(_CLASSES):
-        bpy.utils.unregister_class(one)
+register, unregister = bpy.utils.register_classes_factory(_CLASSES)
