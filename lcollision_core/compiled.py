@@ -141,7 +141,7 @@ class _Compilations:
                 self.seconds += now - self._started
             return
         if now - self._last > _PAUSE_SECONDS:
-            _log.info("compiling for this processor, which takes some seconds once")
+            _log.info("compiling for this processor, which takes a few seconds the first time")
         if self._depth == 0:
             self._started = now
         self._depth, self._last = self._depth + 1, now

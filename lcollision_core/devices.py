@@ -63,7 +63,7 @@ def uses_gpu(n_poses: int, n_faces: int) -> bool:
         return False
     if not _Choice.in_use and n_poses * n_faces >= _WORTHWHILE and _has_extra() and _has_gpu():
         _Choice.in_use = True
-        _Choice.note("checking batches of poses on the GPU; --device cpu leaves it alone")
+        _Choice.note("checking batches of poses on the GPU; use --device cpu to avoid it")
     return _Choice.in_use
 
 

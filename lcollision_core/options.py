@@ -130,8 +130,8 @@ class RuleOptions:
     near_exclusion: Annotated[
         float | None,
         Option(
-            "Count pairs within X body sizes along the surface separately. Default: what the "
-            "character's own rules say, else 0.",
+            "Do not count pairs within X body sizes along the surface; report them separately. "
+            "Default: what the character's own rules say, else 0.",
             metavar="X",
             low=0,
             below=1,

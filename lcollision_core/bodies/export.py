@@ -323,8 +323,8 @@ class SourceFile:
             self.frame = written_frame(self._character)
         else:
             raise MeshFileError(
-                f"has a form that is not written ({suffix or 'no extension'})",
-                f"name one of .obj, {', '.join(SCENE_SUFFIXES)}",
+                f"has a format that cannot be written ({suffix or 'no extension'})",
+                f"use one of .obj, {', '.join(SCENE_SUFFIXES)}",
                 where=path,
             )
 
@@ -439,7 +439,9 @@ class SourceFile:
         MeshFileError : the file cannot be written, or the joints cannot hold a pose.
         """
         if self._character is None or self._body.joints is None:
-            raise MeshFileError.unwritable(path, "the poses are none of its joints", "choose .pc2")
+            raise MeshFileError.unwritable(
+                path, "the poses do not come from its joints", "choose .pc2"
+            )
         space, made = self._body.joints, self._written
         transforms = [_placed(space.transforms(latent), self.frame) for latent in latents]
         frames = write_character_clip(
@@ -470,7 +472,9 @@ class SourceFile:
         """
         character, space, frame = self._character, self._body.joints, self.frame
         if character is None or space is None or frame is None:
-            raise MeshFileError.unwritable(path, "the poses are none of its joints", "choose .pc2")
+            raise MeshFileError.unwritable(
+                path, "the poses do not come from its joints", "choose .pc2"
+            )
         made, check = self._written, self._body.exact_check()
         free: list[list[bool]] = [[] for _ in motions]
 

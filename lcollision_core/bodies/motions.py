@@ -99,7 +99,7 @@ def body_of_smpl(body: Body, path: Path) -> tuple[RigBody, tuple[str, ...]]:
     unknown = [name for name in motion.names if name not in model.names]
     n_shapes = model.shape_directions.shape[2]
     if missing:
-        notes.append(f"it does not turn {_listed(missing)}, which stay as in the body model")
+        notes.append(f"it has no rotations for {_listed(missing)}, which keep their rest pose")
     if unknown:
         notes.append(f"the body model has no {_listed(unknown)}")
     if motion.betas[n_shapes:].any():
@@ -444,7 +444,7 @@ def character_of_motion(body: Body, path: Path) -> Character | None:
 def _of_poses(body: Body, path: Path, fps: float) -> Motion:
     poses = read_poses(path, body)
     if not poses:
-        raise MeshFileError("has no poses in it", "name a file that has some", where=path)
+        raise MeshFileError("contains no poses", "name a file that has some", where=path)
     placements = tuple(pose.placement for pose in poses)
     return Motion(
         path.stem,

@@ -215,7 +215,7 @@ def user_joint_map(motion: SkeletonMotion, space: RigPoseSpace, path: Path) -> J
                 " and others" if len(names_of_both) > 6 else ""
             )
             raise MeshFileError(
-                f"is to move by --joints, and the {kind} has no joint {unknown!r}",
+                f"cannot be retargeted: --joints names {unknown!r}, no joint of the {kind}",
                 f"its joints are {listed}",
                 where=path,
             )
@@ -248,7 +248,7 @@ def with_joint_map(body: Body, file: str | os.PathLike[str]) -> RigBody:
     ModelFileError : see `read_followed`.
     """
     if not isinstance(body, RigBody):
-        what = "is no character with joints, which --joints is for"
+        what = "isn't a rigged character, so --joints doesn't apply"
         raise LCollisionError(what, "name one rigged character", where=body.name)
     try:
         chosen_partners = read_followed(file).joints
@@ -272,8 +272,8 @@ def remember_followed(match: JointMatch, followed: JointMap) -> None:
         with atomic_write(path) as file:
             file.write(json.dumps(document, indent=1, ensure_ascii=False).encode() + b"\n")
     except (OSError, LCollisionError) as error:
-        what = "what is chosen for the joints"
-        raise ModelFileError.because(what, "cannot be kept", error, "try again") from error
+        what = "the joint matching"
+        raise ModelFileError.because(what, "could not be saved", error, "try again") from error
 
 
 def _path(source_joints: Sequence[str], rig_joints: Sequence[str]) -> Path:

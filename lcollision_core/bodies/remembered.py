@@ -167,7 +167,7 @@ def open_character(
         # Damaged, as `with_remembered` reports.
         pass
     except LCollisionError as error:
-        model = model.noted(f"what you chose for its joints is left out: {error.headline}")
+        model = model.noted(f"your joint roles were ignored: {error.headline}")
     return with_remembered(model)
 
 
@@ -189,7 +189,7 @@ def with_remembered(model: RigBody) -> RigBody:
             "its contact rules are those that you chose for it"
         )
     except LCollisionError as error:
-        return model.noted(f"what you chose for it is left out: {error.headline}")
+        return model.noted(f"your settings for it were ignored: {error.headline}")
 
 
 def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigBody, FloatArray] | None:
@@ -358,7 +358,7 @@ def _change(model: Body, change: Callable[[RememberedChoices], RememberedChoices
                 file.write(json.dumps(document, indent=1).encode() + b"\n")
     except (OSError, MeshFileError) as error:
         raise ModelFileError.because(
-            f"what is remembered of {model.name}", "cannot be kept", error, "try again"
+            f"the settings of {model.name}", "could not be saved", error, "try again"
         ) from error
 
 

@@ -834,7 +834,7 @@ def write_skeleton(
     notes: tuple[str, ...] = ()
     if off > _SAME:
         notes = (
-            f"{Path(path).name} holds the turns of joints alone: with it, this body is up to "
-            f"{100.0 * off:.2g} % of its size away from the motion",
+            f"{Path(path).name} stores joint rotations only; played back, the body deviates "
+            f"from the motion by up to {100.0 * off:.2g} % of its size",
         )
     return stored, notes

@@ -219,7 +219,7 @@ def _held(
     holder = next((member for member in members if member.name == part.held_by), None)
     joints = None if holder is None else holder.body.joints
     if holder is None or joints is None:
-        what = f"would be held by {part.held_by!r}, which is no character before it"
+        what = f"is held by {part.held_by!r}, but no character of that name is listed before it"
         raise LCollisionError(what, "name a character of the scene", where=member.name)
     number = joint_named(holder.body, part.joint)
     joint = holder.place.apply(joints.rig.rest[number, :3, 3])

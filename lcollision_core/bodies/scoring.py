@@ -172,9 +172,10 @@ def sample_poses(
         n_kept += len(matching)
         n_misses = 0 if len(matching) else n_misses + _DRAWN_AT_ONCE
         if n_misses >= _MOST_MISSES:
-            kind = "collides" if colliding else "is free"
+            kind = "colliding" if colliding else "collision-free"
             raise LCollisionError(
-                f"none of {n_misses} poses in a row {kind}", "ask for other poses"
+                f"found no {kind} pose in {n_misses} samples in a row",
+                "change the contact rules or the clearance",
             )
         job.report(n_kept, n_poses)
     return samples

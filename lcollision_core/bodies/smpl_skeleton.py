@@ -88,10 +88,7 @@ def skeleton_of_smpl(motion: SmplMotion) -> NodeMotion:
     places[:, 0] = (offsets[0] + motion.places) @ frame.T
     times = np.arange(n_frames) / (motion.rate or NOMINAL_RATE)
     ends, axes = np.full(offsets.shape, np.nan), np.tile(np.eye(3), (len(order), 1, 1))
-    note = (
-        "taken for a motion of SMPL, whose joints turn those of the body; the shape that it was "
-        "made for ('betas') does not count"
-    )
+    note = "read as an SMPL motion and retargeted; its body shape ('betas') is ignored"
     notes = (note, *motion.notes)
     return NodeMotion(
         "", tuple(order), parents, offsets, ends, axes, times, None, turns, places, notes

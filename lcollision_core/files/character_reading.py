@@ -109,8 +109,8 @@ def with_ends_on_limbs(
         f"{rig.joint_names[joint]} with {rig.joint_names[end]}" for joint, end in ends.items()
     )
     note = (
-        "some joints hang beside the limb that they end, as targets of inverse kinematics; here "
-        f"they move with it: {names}"
+        "some joints (IK targets) are attached beside the limb they end; here they move with it: "
+        f"{names}"
     )
     return _in_order(replace(rig, parents=hung, file_parents=rig.parents)), (note,)
 
@@ -621,14 +621,14 @@ def as_gltf(character: Character) -> GltfCharacter:
         document = gltf_of(file.scene, place, character.name, source)
         written = character_of(scene_of(GltfDocument(document.data, source)), source)
         if len(written.joined) != len(document.vertices):
-            raise MeshFileError("parts of it would be lost")
+            raise MeshFileError("some of its parts would be lost")
         from_read, to_read = np.empty(len(written.rest_vertices), np.int64), np.empty_like(rows)
         from_read[written.joined] = character.joined[document.vertices]
         to_read[character.joined[document.vertices]] = written.joined
         if character.rig is not None and written.rig is not None:
             number = {node: joint for joint, node in enumerate(character.rig.nodes.tolist())}
             if number.keys() != set(written.rig.nodes.tolist()):
-                raise MeshFileError("joints of it would be lost")
+                raise MeshFileError("some of its joints would be lost")
             joints = np.array([number[node] for node in written.rig.nodes.tolist()])
             rig = replace(written.rig, chosen=character.rig.chosen)
             written = replace(written, rig=rig, name=character.name)

@@ -306,7 +306,9 @@ class ContactRules:
         ]
         if self.tolerated_depth or not named:
             descriptions.insert(0, f"{self.tolerated_depth:g}")
-        return " or ".join((*descriptions, *(f"as {more} more pairs of groups say",) * (more > 0)))
+        return " or ".join(
+            (*descriptions, *(f"as set for {more} more pairs of groups",) * (more > 0))
+        )
 
     def sentence(self, counts: RuleCounts | Mapping[str, int]) -> str:
         """Describe how many pairs are excluded by which rules; empty if there are none."""

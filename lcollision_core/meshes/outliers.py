@@ -72,7 +72,7 @@ def outlier_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, P
         if scale is None:
             if is_torn(mesh_lengths, reference_lengths):
                 defects[pose] = PoseSetError(
-                    "joins other vertices by edges than the other poses do, as if in another order",
+                    "connects other vertices than the other poses, as if in another vertex order",
                     "export it with the set's vertex order",
                 )
         elif not 1.0 / LARGEST_SIZE < scale < LARGEST_SIZE:

@@ -332,7 +332,7 @@ def read_request(message: bytes) -> Any:
             refused.number = number
         raise refused from None
     except (msgspec.DecodeError, RecursionError, ValueError, OverflowError) as error:
-        refused = RefusedMessageError.because("a message", "is no MessagePack", error)
+        refused = RefusedMessageError.because("a message", "is not MessagePack", error)
         refused.is_readable = False
         raise refused from None
 

@@ -94,7 +94,7 @@ class Session:
         if isinstance(request, m.Hello):
             self._greet(request)
         elif not self._greeted:
-            self._refuse(request.id, LCollisionError("a session begins with hello"))
+            self._refuse(request.id, LCollisionError("the first message must be hello"))
         elif isinstance(request, m.Cancel):
             with self._jobs_lock:
                 job = self._jobs.get(request.request)

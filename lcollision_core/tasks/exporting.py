@@ -119,7 +119,7 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
     require_writable(path)
     if path.exists():
         raise MeshFileError(
-            "cannot be made: it is a file", "name another", where=f"the folder {path}"
+            "cannot be created: a file has this name", "name another", where=f"the folder {path}"
         )
     return Output(path, "folder", None)
 

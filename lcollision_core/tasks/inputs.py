@@ -123,13 +123,13 @@ def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None
             names = say("{names} and {n} more", names=names, n=len(others) - 3)
         left_out = say_number(
             len(others),
-            "{folder}: {names} was left out, which holds no motion",
-            "{folder}: {names} were left out, which hold no motion",
+            "{folder}: skipped {names}: no motion in it",
+            "{folder}: skipped {names}: no motion in them",
             folder=folder,
             names=names,
         )
         if any(path.suffix.lower() == ".npy" for path in others):
-            advice = "{note} that is read; save arrays by name in an .npz file"
+            advice = "{note} that can be read; save arrays by name in an .npz file"
             left_out = say(advice, note=left_out)
         job.note(left_out)
     return files

@@ -405,8 +405,8 @@ def notes_of(first: FirstSamples) -> list[str]:
         )
     if first.box_scale != BOX_SCALE:
         notes.append(
-            f"the latent box is {first.box_scale:g} times the range of the poses, and not "
-            f"{BOX_SCALE:g}, as most samples of a larger one collide"
+            f"the latent box is {first.box_scale:g} times the range of the poses instead of "
+            f"{BOX_SCALE:g}, because most samples of a larger box collide"
         )
     return notes
 

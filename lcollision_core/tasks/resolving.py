@@ -416,7 +416,9 @@ def own_file(body: Body) -> Path:
     LCollisionError : the body has no clips.
     """
     if body.character is None or body.character.smpl is not None:
-        raise LCollisionError("names no motion", "name a motion file", where=body.name)
+        raise LCollisionError(
+            "has no clips", "name a clip, or a file such as .bvh or .pc2", where=body.name
+        )
     return body.character.source
 
 
@@ -681,8 +683,8 @@ def write_motions(
         for motion, row in zip(motions, rows, strict=True):
             if motion.space_at is not None:
                 _count_stuck(row, body, ~check.are_free(motion.codes))
-                left_out = "{path}: poses hold how joints turn; what else shapes the frames of "
-                left_out += "{clip} is left out, which a .glb or .pc2 file holds"
+                left_out = "{path}: pose files store joint rotations only; other deformation in "
+                left_out += "{clip} is left out (use .glb or .pc2 to keep it)"
                 job.note(say(left_out, path=output.path, clip=motion.name))
 
 

@@ -479,7 +479,8 @@ def contacts_text(contacts: dict[str, Any] | None) -> str | None:
         return None
     lost = [" and ".join(names) for names in contacts["lost"]]
     contact_text = say(
-        "{kept} of {all} contacts kept, in {together} of {frames} frames of them",
+        "{kept} of {all} contacts kept; together in {together} of {frames} frames, counted per "
+        "contact",
         kept=len(contacts["kept"]),
         all=len(contacts["kept"]) + len(lost),
         together=contacts["frames_together"],

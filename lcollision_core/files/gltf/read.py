@@ -104,7 +104,7 @@ def notes_on_extensions(document: GltfDocument) -> Iterator[str]:
         for kind, number, name in _POINTED.findall(pointer_of(target))
     ]
     if shaping:
-        yield left_out_note("its clips animate what is not supported", shaping)
+        yield left_out_note("its clips animate unsupported properties", shaping)
     readable = _READ | COMPRESSIONS
     for name in dict.fromkeys(document.description.get("extensionsUsed", ())):
         if name not in readable and not _APPEARANCE.search(name):
@@ -491,7 +491,7 @@ def _faces(
         faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     else:
         if len(corners) % 3:
-            raise MeshFileError(f"have {len(corners)} corners, no multiple of 3", where=where)
+            raise MeshFileError(f"has {len(corners)} corners, not a multiple of 3", where=where)
         faces = corners.reshape(-1, 3)
     wrong = np.flatnonzero((faces >= n_vertices).any(axis=1))
     if len(wrong):

@@ -241,7 +241,7 @@ class GltfDocument:
         dtype = component_dtype(sparse["indices"].get("componentType"), what)
         places = self._view(sparse["indices"], what, n, 1, dtype)[:, 0]
         if n and not (dtype.kind == "u" and places.max() < len(values)):
-            raise MeshFileError("are sparse at places that they do not have", where=what)
+            raise MeshFileError("have sparse indices out of range", where=what)
         values[places] = self._view(sparse["values"], what, n, values.shape[1], values.dtype)
         return values
 
@@ -328,7 +328,7 @@ class GltfDocument:
         if "uri" in described:
             return resource(described["uri"], self.path, MAX_FILE_BYTES, what)
         views, index = self.objects("bufferViews"), described.get("bufferView")
-        view = require_element(views, index, f"for {what} the buffer view")
+        view = require_element(views, index, f"the buffer view of {what}")
         length = require_int(view.get("byteLength"), f"the length of {what}", 0, MAX_FILE_BYTES)
         return self._view(described, what, length, 1, np.dtype("u1")).tobytes()
 
@@ -458,7 +458,7 @@ def require_element(items: Sequence[T] | None, index: object, what: str) -> T:
     """Return an element of a list of the file, or raise `MeshFileError` if it does not exist."""
     n = len(items or ())
     if items is None or type(index) is not int or not 0 <= index < n:
-        raise MeshFileError(f"names {what} {quoted(index)}, there are {n}", where="it")
+        raise MeshFileError(f"refers to {what} {quoted(index)}, but has only {n}", where="it")
     return items[index]
 
 

@@ -164,7 +164,7 @@ def _parsed(text: str, encoding: str) -> Bvh:
     if not (n_frames == int(n_frames) and n_frames >= 1):
         raise MeshFileError(f"it announces {n_frames:g} frames")
     if not frame_time > 0.0:
-        raise MeshFileError(f"the time from frame to frame is {frame_time:g}")
+        raise MeshFileError(f"its frame time is {frame_time:g}, it must be above 0")
     count, n_columns = int(n_frames), sum(map(len, channels))
     frames = tuple(rows[place] for place in lines[3:])
     if len(frames) < count:
@@ -179,7 +179,7 @@ def _parsed(text: str, encoding: str) -> Bvh:
     for name, (columns, _) in zip(names, bvh._columns(_SCALES), strict=True):
         if np.abs(numbers[:, columns] - 1.0).max(initial=0.0) > _UNSCALED:
             raise MeshFileError(
-                f"it scales the joint {name[:40]!r}, and only turns and places of joints are read",
+                f"it scales the joint {name[:40]!r}; only rotations and positions can be read",
                 "export it without scale channels",
             )
     return bvh
@@ -235,7 +235,7 @@ def _hierarchy(
             if len(names) == _MOST_JOINTS:
                 raise MeshFileError(f"it has more than {_MOST_JOINTS} joints")
             if word == "JOINT" and (not open_ or open_[-1] is None):
-                raise MeshFileError("a joint of it hangs on nothing")
+                raise MeshFileError("a joint is outside the hierarchy")
             parents.append(-1 if word == "ROOT" else open_[-1] or 0)
             names.append(name())
             offsets.append([0.0, 0.0, 0.0])
@@ -280,7 +280,7 @@ def _hierarchy(
 def _value(rows: list[str], lines: list[int], number: int, name: str) -> float:
     label, colon, value = (rows[lines[number]] if number < len(lines) else "").partition(":")
     if " ".join(label.split()).casefold() + colon != name.casefold():
-        raise MeshFileError(f"it does not say {name!r} after MOTION")
+        raise MeshFileError(f"{name!r} is missing after MOTION")
     return _number(value.strip())
 
 

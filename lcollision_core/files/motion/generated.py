@@ -181,7 +181,7 @@ def _samples(path: Path) -> list[tuple[str, FloatArray, str]]:
         lengths = np.asarray(content.get("lengths", [motion.shape[3]] * len(motion))).reshape(-1)
         if len(lengths) != len(motion) or lengths.dtype.kind not in "iu":
             raise MeshFileError("its 'lengths' are not whole numbers, one for each motion")
-        places = np.moveaxis(_usable(motion, "motion"), 3, 1)
+        places = np.moveaxis(_usable(motion, "'motion'"), 3, 1)
         several = len(places) > 1
         return [
             (f"{path.stem} {n + 1}" if several else "", sample[: max(int(length), 1)], "of MDM")
@@ -231,10 +231,10 @@ def _of_sample(name: str, places: FloatArray, what: str) -> NodeMotion:
 
 def _usable(array: npt.NDArray[Any], name: str) -> FloatArray:
     if array.dtype.kind != "f" or not array.size:
-        raise MeshFileError(f"{name!r} is {array.dtype} {array.shape}, expected floats by frame")
+        raise MeshFileError(f"{name} is {array.dtype} {array.shape}, expected floats by frame")
     floats: FloatArray = array.astype(np.float64)
     if not (np.abs(floats) <= _LARGEST).all():
-        raise MeshFileError(f"{name!r} has numbers that cannot be used")
+        raise MeshFileError(f"{name} has a number that is not finite or too large")
     return floats
 
 

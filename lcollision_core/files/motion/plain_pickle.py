@@ -59,7 +59,7 @@ def _scalar(kind: _Type, held: bytes) -> Any:
 
 def _from_text(text: str, encoding: str) -> bytes:
     if encoding != "latin1":
-        raise pickle.UnpicklingError("it holds a text that is no bytes")
+        raise pickle.UnpicklingError("it has text where bytes are expected")
     return text.encode("latin1")
 
 

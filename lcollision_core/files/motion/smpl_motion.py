@@ -286,7 +286,8 @@ def _floats(
     unusable = np.flatnonzero(~(np.abs(floats.reshape(len(floats), -1)) <= _LARGEST).all(axis=1))
     if len(unusable):
         raise MeshFileError(
-            f"has a number that cannot be used in frame {unusable[0]}", where=f"its array {name!r}"
+            f"has a number that is not finite or too large in frame {unusable[0]}",
+            where=f"its array {name!r}",
         )
     return floats
 

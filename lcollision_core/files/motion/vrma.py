@@ -58,9 +58,9 @@ def _left_out(document: GltfDocument, n_clips: int) -> Iterator[str]:
     if named:
         yield left_out_note("facial expressions are left out", map(str, named))
     if extension.get("lookAt"):
-        yield "where the eyes look is left out"
+        yield "the gaze (lookAt) is left out"
     if n_clips > 1:
-        yield f"of its {n_clips} animations the first is read, as VRM has it"
+        yield f"only the first of its {n_clips} animations is read, as VRM defines"
 
 
 _EXTENSION = "VRMC_vrm_animation"

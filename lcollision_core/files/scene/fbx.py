@@ -318,7 +318,7 @@ class FbxDocument:
             with np.load(io.BytesIO(answer), allow_pickle=False) as arrays:
                 return dict(arrays)
         except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
-            raise MeshFileError("it is a damaged FBX file, on which its reader crashed") from error
+            raise MeshFileError("it is a damaged FBX file: the reader crashed on it") from error
 
     def _run(self, request: bytes) -> tuple[int, bytes, bytes]:
         """Return the exit status, output and error output of the reading process."""

@@ -249,7 +249,9 @@ def _floats(
         array = _plain(arrays, name, "f", shape).astype(np.float64)
     # Comparisons with NaN are false.
     if not (np.abs(array) <= _LARGEST).all():
-        raise MeshFileError("has a number that cannot be used", where=f"its array {name!r}")
+        raise MeshFileError(
+            "has a number that is not finite or too large", where=f"its array {name!r}"
+        )
     return array
 
 

@@ -204,7 +204,7 @@ def test_resolve_writes_what_it_checked(
         ("out.ply", ("--like", "own.obj"), "own.obj does not offer .ply; choose one of its forms"),
         ("out.obj", ("--like", "own.obj", "--form", "mesh"), "does not offer .obj with the form"),
         ("out.obj", ("--like", "none.obj"), "there is no such file"),
-        ("out.obj", ("--like", "poses.json"), "has a form that is not written (.json)"),
+        ("out.obj", ("--like", "poses.json"), "has a format that cannot be written (.json)"),
         ("out.obj", ("--like", "other.obj"), "has 3 vertices"),
         ("out.json", ("--like", "own.obj"), "would contain codes"),
         ("out.glb", ("--form", "morph"), "applies only to a character's file"),

@@ -280,7 +280,7 @@ def test_a_rigged_fbx_comes_back_as_a_rigged_glb_with_its_clip_free(
 def test_what_is_no_motion_is_said(lcollision: Lcollision, swing: Path, tmp_path: Path) -> None:
     none = lcollision("resolve", "body", "--motion", "-o", tmp_path / "out.json")
     assert none.exit_code == 2
-    assert "names no motion" in none.stderr
+    assert "has no clips" in none.stderr
     empty = lcollision("resolve", swing, "-o", tmp_path / "out.json")
     assert empty.exit_code == 2
     assert "names no pose to resolve" in empty.stderr

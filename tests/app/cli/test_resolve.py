@@ -500,8 +500,8 @@ def test_an_output_that_cannot_be_is_refused_first(
         (tmp_path / "free.txt", ".txt is not a known format"),
         (tmp_path / ("x" * 300 + ".json"), "File name too long"),
         (tmp_path / ("x" * 300), "File name too long"),
-        (f"{tmp_path / 'free'}/", "cannot be made: it is a file; name another"),
-        (tmp_path / "free", "cannot be made: it is a file; name another"),
+        (f"{tmp_path / 'free'}/", "cannot be created: a file has this name; name another"),
+        (tmp_path / "free", "cannot be created: a file has this name; name another"),
         (tmp_path / "free.obj", "is one mesh file, but there are 5 poses"),
     ):
         result = lcollision("resolve", model_file, poses, "-o", out)

@@ -132,7 +132,7 @@ def test_motions_by_name_and_in_subfolders_are_as_a_folder(
     assert all(Path(row["output"]).is_file() for row in rows)
     assert "joints.npy" in result.stderr
     assert "shape.npz" in result.stderr
-    assert "were left out, which hold no motion that is read; save arrays by name" in result.stderr
+    assert "no motion in them that can be read; save arrays by name" in result.stderr
     # By a shell's pattern, whatever their shapes; results within the folder are not inputs.
     named = [walks / "Subject1" / "walk.npz", walks / "Subject2" / "walk.npz"]
     result = lcollision("resolve", model, *named, "--motion", "-o", tmp_path / "two/", "--json")
@@ -222,7 +222,7 @@ def test_what_cannot_be_is_said(lcollision: Lcollision, tmp_path: Path, model: P
         (("check", source, "--clips"), "name one with --body"),
         (("check", source, "--clips", "--body", "body"), "which a body without joints"),
         (("resolve", model, source, other, "--motion", "-o", out), "is of another shape"),
-        (("resolve", model, "--motion", "-o", out), "names no motion"),
+        (("resolve", model, "--motion", "-o", out), "has no clips"),
     ):
         result = lcollision(*arguments)
         assert result.exit_code == 2

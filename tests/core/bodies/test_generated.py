@@ -241,7 +241,7 @@ def test_a_motion_of_smpl_moves_the_limbs_of_another_body(tmp_path: Path) -> Non
     body = RigBody.of(rigged_body())
     same, notes = body_of_motion(body, path)
     assert same is body
-    assert "taken for a motion of SMPL" in notes[0]
+    assert "read as an SMPL motion" in notes[0]
     (motion,) = read_motions(body, path)
     assert motion.rate == pytest.approx(60.0)
     ours = list(body.space.rig.joint_names)

@@ -145,7 +145,7 @@ def test_what_does_not_apply_is_left_out_and_said(path: Path, change: dict, why:
     body = opened(path)
     assert not body.rules_are_chosen
     assert body.card.domain_names == body.own_card.domain_names
-    assert body.notes[-1].startswith("what you chose for it is left out: ")
+    assert body.notes[-1].startswith("your settings for it were ignored: ")
     assert why in body.notes[-1]
     if "format_version" in change or "format" in change:
         for keep in (remember_choices, lambda held: remember_file(held, path)):

@@ -293,7 +293,7 @@ def test_another_order_of_vertices_is_refused(model: LearnedBody) -> None:
         mesh[rng.permutation(len(mesh))],
         rng.normal(0.0, LENGTH_IN_FILES, mesh.shape),
     ):
-        with pytest.raises(PoseSetError, match="as if in another order"):
+        with pytest.raises(PoseSetError, match="as if in another vertex order"):
             model.encode(foreign)
 
 

@@ -312,7 +312,7 @@ def test_a_skeleton_of_something_else_is_refused(tmp_path: Path) -> None:
     [
         ("Frames: 48", "Frames: 49", "announces 49 frames and contains 48"),
         ("Frames: 48", "Frames: many", "'many' is not a number"),
-        ("Frame Time: ", "Frame Time: -", "the time from frame to frame is -0.0333"),
+        ("Frame Time: ", "Frame Time: -", "its frame time is -0.0333"),
         ("HIERARCHY", "HIERARCHIE", "it is not a BVH file"),
         ("MOTION", "", "it is not a BVH file"),
         ("Zrotation", "Wrotation", "has unknown or repeated channels"),

@@ -142,7 +142,9 @@ def test_files_that_are_not_of_the_body_are_refused(model: RigBody, tmp_path: Pa
     with pytest.raises(PoseSetError, match="has 3 vertices"):
         SourceFile(tmp_path / "few.obj", model)
     write_mesh(tmp_path / "own.ply", model.reference, model.faces)
-    with pytest.raises(MeshFileError, match=r"own\.ply has a form that is not written \(\.ply\)"):
+    with pytest.raises(
+        MeshFileError, match=r"own\.ply has a format that cannot be written \(\.ply\)"
+    ):
         SourceFile(tmp_path / "own.ply", model)
 
 

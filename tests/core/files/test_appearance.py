@@ -262,8 +262,8 @@ def test_a_damaged_image_leaves_the_colour_and_a_note(
         ({"images": [{"bufferView": 99}]}, "names for image 0 the buffer view 99"),
         ({"images": [{}]}, "names for image 0 the buffer view None"),
         ({"textures": [{}]}, "names an image None"),
-        ({"textures": [{"source": 7}]}, "names an image 7, there are 1"),
-        ({"textures": []}, "names a texture 0, there are 0"),
+        ({"textures": [{"source": 7}]}, "refers to an image 7, but has only 1"),
+        ({"textures": []}, "refers to a texture 0, but has only 0"),
     ],
 )
 def test_a_missing_image_leaves_the_colour_and_a_note(

@@ -306,7 +306,7 @@ def test_pointers_to_transforms_are_followed_and_others_said(tmp_path: Path) -> 
     builder.description["extensionsUsed"] = ["KHR_animation_pointer", "KHR_node_visibility"]
     scene = read_scene(builder.write(tmp_path / "m.glb"))
     assert scene.notes == (
-        "its clips animate what is not supported: visibility of rig:LeftArm, weights of Rig",
+        "its clips animate unsupported properties: visibility of rig:LeftArm, weights of Rig",
     )
     by_pointer = scene.clips[1].sample(np.array([0.4])).transforms[0, 2, :3, :3]
     by_node = scene.clips[0].sample(np.array([0.4])).transforms[0, 2, :3, :3]

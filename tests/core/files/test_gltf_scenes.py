@@ -448,7 +448,7 @@ def _without_weights() -> GltfBuilder:
         (_changed("nodes", 3, children=[0]), "node 0 .* is its own ancestor"),
         (_changed("nodes", 3, children=[99]), "child of node 3 must be a whole number from 0 to 4"),
         (_changed("nodes", 4, mesh=7), "mesh of node 4 must be"),
-        (_changed("nodes", 4, skin=7), "names the skin 7, there are 1"),
+        (_changed("nodes", 4, skin=7), "refers to the skin 7, but has only 1"),
         (_changed("nodes", 2, rotation=[0, 0, 1]), "rotation of node 2 must be 4 finite numbers"),
         (_changed("skins", 0, joints=[1, 2, 77]), "joint of skin 0 must be"),
         (_changed("skins", 0, joints=[1]), "is moved by joints .* expected 0 to 0"),

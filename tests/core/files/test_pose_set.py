@@ -172,7 +172,7 @@ def test_a_pose_in_another_unit_or_order_of_vertices_is_refused(
     shuffled = np.random.default_rng(1).permutation(tube.vertices.shape[1])
     for spoilt, defect in (
         (tube.vertices[1] * 100.0, "is 100 times as large as the other poses; scale it by 0.01"),
-        (tube.vertices[1][shuffled], "joins other vertices by edges than the other poses do"),
+        (tube.vertices[1][shuffled], "connects other vertices than the other poses"),
         (tube.vertices[1] * 0.0, "has no size; remove it"),
     ):
         vertices = tube.vertices.copy()

@@ -199,7 +199,7 @@ def test_smplx_has_expressions_after_its_shapes(tmp_path: Path) -> None:
         ({"kintree_table": np.full((2, 24), 30, np.uint32)}, "comes before its parent"),
         ({"weights": np.full((96, 24), 0.5)}, "do not sum to 1"),
         ({"f": np.full((4, 3), 96, np.uint32)}, r"names vertices \[96, 96, 96\], expected 0 to 95"),
-        ({"shapedirs": np.full((96, 3, 4), np.nan)}, "'shapedirs' has a number that cannot be"),
+        ({"shapedirs": np.full((96, 3, 4), np.nan)}, "'shapedirs' has a number that is not finite"),
         ({"poses": np.zeros((2, 72)), "trans": np.zeros((2, 3)), "v_template": None}, "a motion"),
         ({"J_regressor": np.array({}, dtype=object)}, "numpy.savez"),
     ],

@@ -100,7 +100,7 @@ def test_depths_of_pairs_are_said_with_their_groups() -> None:
     assert TOLERANT.summary() == "not deeper than tolerated"
     assert TOLERANT.named_groups == ("Belly", "Arm")
     five = ContactRules(tolerated_depth=0.1, tolerated_pairs=(("a", "b", 0.2),) * 5)
-    assert five.described().endswith("0.2 between a and b or as 2 more pairs of groups say")
+    assert five.described().endswith("0.2 between a and b or as set for 2 more pairs of groups")
     assert ContactRules(tolerated_pairs=(("a", "b", 0.0),)).described() == ""
 
 

@@ -238,5 +238,5 @@ def test_a_session_begins_with_hello_of_a_known_version() -> None:
         check=True,
         cwd=ROOT,
     )
-    assert b"a session begins with hello" in process.stdout
+    assert b"the first message must be hello" in process.stdout
     assert b"the version of the protocol must be 1, got 99; use a client" in process.stdout
