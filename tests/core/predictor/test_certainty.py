@@ -9,7 +9,7 @@ import pytest
 from scipy.special import expit, ndtr
 from scipy.stats import binom
 
-from lcollision_core.bodies import LearnedBody, check_poses
+from lcollision_core.bodies import LearnedBody, check_poses, scoring
 from lcollision_core.options import RuleOptions
 from lcollision_core.predictor.metrics import ERROR_BOUNDS, SureRange, sure_ranges
 
@@ -75,7 +75,9 @@ def test_few_samples_confirm_no_small_bound() -> None:
     assert sure_ranges(logit, colliding)[0].coverage == 1.0
 
 
-def test_what_is_not_sure_is_checked_exactly(body: LearnedBody) -> None:
+def test_what_is_not_sure_is_checked_exactly(
+    body: LearnedBody, monkeypatch: pytest.MonkeyPatch
+) -> None:
     latent = body.sample(60, np.random.default_rng(0))
     truth = body.detector.are_colliding(body.decode(latent).astype(np.float32))
     predictor = body.require_predictor()
@@ -99,3 +101,6 @@ def test_what_is_not_sure_is_checked_exactly(body: LearnedBody) -> None:
     # The predictor does not know of tolerated depths.
     tolerant = sure.with_options(RuleOptions(tolerated_depth=1e-3))
     assert check_poses(tolerant, latent, 2e-2).exact.all()
+    # A GPU checks a pose in less time than an estimate takes.
+    monkeypatch.setattr(scoring, "takes_gpu", lambda *_: True)
+    assert check_poses(sure, latent, 2e-2).exact.all()
