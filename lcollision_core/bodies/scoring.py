@@ -16,7 +16,7 @@ from lcollision_core.acap.codec import BLOCK_POSES
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.learned_body import LearnedBody
 from lcollision_core.contact import CollisionDetector, touching_patches
-from lcollision_core.devices import block_size, takes_gpu
+from lcollision_core.devices import block_size, uses_gpu
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.meshes import GROUP_KINDS, ContactRules
@@ -113,7 +113,7 @@ def _sure_verdicts(
     if error_bound <= 0.0 or not model.has_predictor:
         return nothing, nothing
     # A GPU decodes and checks a pose in less time than an estimate takes.
-    if clearance == 0.0 and takes_gpu(len(codes), model.topology.n_faces):
+    if clearance == 0.0 and uses_gpu(len(codes), model.topology.n_faces):
         return nothing, nothing
     predictor = model.require_predictor()
     store = predictor.facts.store

@@ -102,5 +102,5 @@ def test_what_is_not_sure_is_checked_exactly(
     tolerant = sure.with_options(RuleOptions(tolerated_depth=1e-3))
     assert check_poses(tolerant, latent, 2e-2).exact.all()
     # A GPU checks a pose in less time than an estimate takes.
-    monkeypatch.setattr(scoring, "takes_gpu", lambda *_: True)
+    monkeypatch.setattr(scoring, "uses_gpu", lambda *_: True)
     assert check_poses(sure, latent, 2e-2).exact.all()
