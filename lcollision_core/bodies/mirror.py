@@ -456,8 +456,6 @@ def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int)
     -------
     symmetry : None if there is none
     """
-    from scipy.spatial import cKDTree
-
     used, faces = topology.used_vertices, topology.faces
     vertices = np.asarray(reference, dtype=np.float64)[used]
     size = float(np.ptp(vertices, axis=0).max())

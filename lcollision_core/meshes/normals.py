@@ -135,8 +135,7 @@ def moved_normals(
     # The map from the rows of `old` to those of `new` is new^T old^-T; its inverse transpose is
     # new^-1 old.
     turned = np.linalg.solve(new, old @ normals[owners][:, :, None])[:, :, 0]
-    lengths = np.linalg.norm(turned, axis=1, keepdims=True)
-    turned = np.divide(turned, lengths, out=np.zeros_like(turned), where=lengths > 0.0)
+    turned = unit(turned)
     turned *= np.square(new[:, 2]).sum(axis=1, keepdims=True)
     sums = np.stack([np.bincount(owners, axis, len(normals)) for axis in turned.T], axis=1)
     lengths = np.linalg.norm(sums, axis=1, keepdims=True)

@@ -131,11 +131,7 @@ class Session:
 
         job = Job(at_most_every(_BETWEEN_PROGRESS, told))
         with self._jobs_lock:
-            if request.id in self._jobs:
-                is_known = True
-            else:
-                is_known = False
-                self._jobs[request.id] = job
+            is_known = self._jobs.setdefault(request.id, job) is not job
         if is_known:
             what = f"request {request.id} is still running"
             self._refuse(request.id, LCollisionError(what, "use increasing ids"))

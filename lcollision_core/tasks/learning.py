@@ -33,10 +33,10 @@ from lcollision_core.tasks.sources import gather_poses, with_proposed_rules
 from lcollision_core.tasks.work_folder import WorkFolder
 
 if TYPE_CHECKING:
-    from lcollision_core.embedding.training_run import EmbeddingConfig, TrainingStatus
+    from lcollision_core.embedding.training_run import TrainingStatus
     from lcollision_core.labels import LabelRows, LabelStatus
     from lcollision_core.labels.labeller import StoreIdentity
-    from lcollision_core.predictor import CollisionPredictor, PredictorConfig, PredictorStatus
+    from lcollision_core.predictor import CollisionPredictor, PredictorStatus
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from lcollision_core.files.table import POSES_SUFFIX, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import ExportRequest, MotionChoice, SceneOptions
 from lcollision_core.tasks.exporting import refuse_to_replace, source_files
-from lcollision_core.tasks.members import written_members
+from lcollision_core.tasks.members import write_members, written_members
 from lcollision_core.tasks.words import say
 
 if TYPE_CHECKING:
@@ -522,8 +522,6 @@ def export_scene_pose(
     folder: Path, body: SceneBody, pose: NamedPose, request: ExportRequest, job: Job
 ) -> str:
     """Write a pose of a scene, each body to its own file; return a sentence for the status bar."""
-    from lcollision_core.tasks.members import write_members
-
     vertices = body.exported_vertices(pose.latent, pose.placement)
     write_members(folder, body, [pose], [vertices], request, job)
     return say("Exported each body to {folder}", folder=folder.name)

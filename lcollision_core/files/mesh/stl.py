@@ -22,6 +22,7 @@ from lcollision_core.files.mesh.polygons import (
     with_order_of,
 )
 from lcollision_core.files.mesh.text import number_rows
+from lcollision_core.meshes.normals import unit
 from lcollision_core.meshes.topology import Topology
 
 _HEADER_BYTES = 84
@@ -118,7 +119,6 @@ def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:
     triangles["corners"] = corners
     exact = corners.astype(np.float64)
     normals = np.cross(exact[:, 1] - exact[:, 0], exact[:, 2] - exact[:, 0])
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    triangles["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+    triangles["normal"] = unit(normals)
     header = b"binary STL".ljust(80, b"\0") + len(faces).to_bytes(4, "little")
     return header + triangles.tobytes()

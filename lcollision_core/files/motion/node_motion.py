@@ -13,6 +13,7 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.files.scene.joined import sample_clip
 from lcollision_core.files.scene.scene import Clip, Scene, parents_first
 from lcollision_core.files.scene.transforms import are_regular
+from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.topology import FloatArray
 
 _SAME_AXIS = 0.5
@@ -148,7 +149,7 @@ def motions_of_scene(
         rate: float | FloatArray | None = fps
         if most is not None:
             times = chosen_clip.times(fps)
-            rate = times[np.linspace(0, len(times) - 1, min(len(times), most)).round().astype(int)]
+            rate = times[evenly_spaced(len(times), most)]
         motions.append(motion_of_nodes(scene, chosen_clip, nodes, names, rate))
     return motions
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.errors import MeshFileError
@@ -18,6 +17,7 @@ from lcollision_core.files.gltf.schema import GltfDocument, extension_of, inner
 from lcollision_core.files.motion.node_motion import NodeMotion, motion_of_nodes
 from lcollision_core.files.safe import read_regular
 from lcollision_core.files.scene.scene import left_out_note, parents_first
+from lcollision_core.files.scene.transforms import signs_on_one_side
 from lcollision_core.meshes.topology import FloatArray
 
 _MOST_BYTES = 1 << 30
@@ -110,9 +110,7 @@ def vrma_bytes(
     for number in range(len(names)):
         turned = Rotation.from_matrix(turns[:, number]).as_quat()
         # Make interpolation between keys take the shorter arc.
-        flips = np.cumprod(np.where((turned[1:] * turned[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))
-        turned[1:] *= flips[:, None]
-        move(number, "rotation", turned)
+        move(number, "rotation", turned * signs_on_one_side(turned)[:, None])
     bones = {name: {"node": number} for number, name in enumerate(names)}
     file.description |= {
         "scene": 0,

@@ -271,10 +271,7 @@ def character_parts(scene: Scene) -> list[int]:
     joints = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
 
     def with_carriers(node: int) -> list[int]:
-        nodes = [node]
-        while scene.parents[nodes[-1]] >= 0:
-            nodes.append(int(scene.parents[nodes[-1]]))
-        return nodes
+        return [node, *_ancestors(scene, node)]
 
     moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
     movers = joints | moved.difference(*map(with_carriers, joints))
