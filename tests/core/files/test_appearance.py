@@ -259,9 +259,9 @@ def test_a_damaged_image_leaves_the_colour_and_a_note(
     [
         ({"images": [{"uri": "gone.png"}]}, "image 0 'gone.png' cannot be read"),
         ({"images": [{"uri": "../secret.png"}]}, "it is not beside the file"),
-        ({"images": [{"bufferView": 99}]}, "names for image 0 the buffer view 99"),
-        ({"images": [{}]}, "names for image 0 the buffer view None"),
-        ({"textures": [{}]}, "names an image None"),
+        ({"images": [{"bufferView": 99}]}, "refers to the buffer view of image 0 99"),
+        ({"images": [{}]}, "refers to the buffer view of image 0 None"),
+        ({"textures": [{}]}, "refers to an image None"),
         ({"textures": [{"source": 7}]}, "refers to an image 7, but has only 1"),
         ({"textures": []}, "refers to a texture 0, but has only 0"),
     ],

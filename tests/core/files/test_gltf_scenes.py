@@ -464,7 +464,7 @@ def _without_weights() -> GltfBuilder:
         (_changed("bufferViews", 0, byteLength=10**9), "length of the positions"),
         (_changed("bufferViews", 0, buffer=3), "buffer of the positions of mesh 0 must be"),
         (_changed("bufferViews", 0, byteStride=1), "stride of the positions of mesh 0 must be"),
-        (_changed("animations", 0, samplers=[]), "names a sampler of animation 'wave' 0"),
+        (_changed("animations", 0, samplers=[]), "refers to a sampler of animation 'wave' 0"),
     ],
 )  # fmt: skip
 def test_wrong_numbers_are_named(tmp_path: Path, builder: GltfBuilder, message: str) -> None:
