@@ -155,7 +155,7 @@ def test_what_stopped_as_nearly_all_samples_collide_goes_on_regardless_once_it_i
         lambda run: run.state == RunState.FAILED and not run.status.mostly_collides,
     )
     # All samples collide, so even then there is nothing to learn.
-    assert "training needs some of each" in again.status.sentence
+    assert "training needs colliding, free and held-out rows" in again.status.sentence
 
 
 def test_what_cannot_be_learned_from_is_said_in_one_sentence(

@@ -50,7 +50,7 @@ def test_a_loose_foot_hangs_on_its_shin(model: RigBody) -> None:
         assert model.space.roles[foot] is Role.FOOT
         assert model.space.anatomy.labels[foot] == f"{side} foot"
     assert (rig.parents < np.arange(len(rig.parents))).all()
-    (note,) = (note for note in model.notes if "inverse kinematics" in note)
+    (note,) = (note for note in model.notes if "IK targets" in note)
     assert "LeftLegIK with LeftLeg" in note
 
 
@@ -99,4 +99,4 @@ def test_limbs_as_they_should_be_stay_as_they_are(tmp_path: Path) -> None:
         character = read_character(write_gltf(body, tmp_path / f"{name}.glb"))
         assert character.rig is not None
         assert character.rig.file_parents is None
-        assert not any("inverse kinematics" in note for note in character.notes)
+        assert not any("IK targets" in note for note in character.notes)
