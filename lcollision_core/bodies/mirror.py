@@ -129,7 +129,7 @@ def checked_mesh(
     if is_torn(lengths, size * reference_lengths):
         raise PoseSetError(
             f"the edges of the mesh join other vertices than those of {model!r}, as if in "
-            "another order",
+            "another vertex order",
             "export it with the model's vertex order",
         )
     return mesh

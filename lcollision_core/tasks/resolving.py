@@ -40,12 +40,7 @@ if TYPE_CHECKING:
     from lcollision_core.bodies.motions import MotionChange
     from lcollision_core.labels.labelling_run import FromWorker
     from lcollision_core.meshes import ContactRules
-    from lcollision_core.motion import (
-        Motion,
-        MotionReport,
-        ScreenedMotion,
-        Solved,
-    )
+    from lcollision_core.motion import Motion, MotionReport, ScreenedMotion, Solved
     from lcollision_core.resolve import ResolveResult
     from lcollision_core.tasks.job import Arrays, KeptPose
 
@@ -683,8 +678,8 @@ def write_motions(
         for motion, row in zip(motions, rows, strict=True):
             if motion.space_at is not None:
                 _count_stuck(row, body, ~check.are_free(motion.codes))
-                left_out = "{path}: pose files store joint rotations only; other deformation in "
-                left_out += "{clip} is left out (use .glb or .pc2 to keep it)"
+                left_out = "{path}: pose files store rotations and weights only; other deformation "
+                left_out += "in {clip} is left out (use .glb or .pc2 to keep it)"
                 job.note(say(left_out, path=output.path, clip=motion.name))
 
 

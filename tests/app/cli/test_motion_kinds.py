@@ -355,7 +355,7 @@ def test_what_shapes_a_frame_turns_with_its_joints_in_every_form(
     # Poses contain the weights of morph targets.
     is_held = motion.space_at is None
     assert is_held == (file.stem == "arm_morph")
-    left_out = f"what else shapes the frames of {motion.name} is left out"
+    left_out = f"other deformation in {motion.name} is left out"
     assert (left_out not in result.stderr) == is_held
     (row,) = json.loads(result.stdout)
     decoded = body.decode(np.array([pose.latent for pose in read_poses(poses, body)]))

@@ -262,7 +262,7 @@ def test_a_learned_body_with_something_on_one_side_is_mirrored(
     assert found.shape == expected.shape
     image, exact = (
         one.pose_mirror.nearest(
-            find_exact(one).image(body.decode(samples[0])) / body.body_size, UNWATCHED
+            find_exact(one).mirror_vertices(body.decode(samples[0])) / body.body_size, UNWATCHED
         )
         for one in (other, body)
     )

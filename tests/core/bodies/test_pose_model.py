@@ -400,7 +400,7 @@ def test_sampling_gives_up_in_a_sentence(
     box = model.embedding.box
     calm = replace(model.embedding, box=LatentBox(0.01 * box.low, 0.01 * box.high))
     calm_model = LearnedBody("calm", calm, model.card)
-    with pytest.raises(LCollisionError, match="none of 128 poses"):
+    with pytest.raises(LCollisionError, match="no colliding pose in 128 samples"):
         sample_poses(calm_model, 1, seed=0, colliding=True)
 
 

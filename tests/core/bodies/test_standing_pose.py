@@ -56,13 +56,13 @@ class Stored:
     def __len__(self) -> int:
         return len(self.world)
 
-    def turns(self) -> FloatArray:
+    def rotations(self) -> FloatArray:
         turned = self.world @ self.axes
         local = np.swapaxes(turned[:, PARENTS], -2, -1) @ turned
         local[:, 0] = turned[:, 0]
         return local
 
-    def places(self) -> FloatArray:
+    def positions(self) -> FloatArray:
         places = np.broadcast_to(self.offsets, (len(self), len(self.names), 3)).copy()
         places[:, 0] = self.roots
         return places

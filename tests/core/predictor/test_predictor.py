@@ -208,7 +208,7 @@ def test_a_section_that_does_not_fit_is_refused(
     section = predictor.to_section()
     unknown = Section(section.arrays, {**section.metadata, "preset": "oracle"})
     with pytest.raises(
-        ModelFileError, match="unknown preset, expected default or paper, got 'oracle'"
+        ModelFileError, match="unknown preset, expected default or large or paper, got 'oracle'"
     ):
         CollisionPredictor.from_section(unknown, tube_model.embedding)
     name = min(section.arrays)

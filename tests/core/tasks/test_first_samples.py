@@ -111,7 +111,7 @@ def test_a_run_stops_before_the_predictor_where_nearly_all_samples_collide(
     work.allow_mostly_colliding()
     assert work.request.regardless
     assert work.request == WorkFolder(work.destination).request
-    with pytest.raises(LabelStoreError, match="training needs some of each"):
+    with pytest.raises(LabelStoreError, match="training needs colliding, free and held-out rows"):
         learn_model(work)
     assert work.labels.exists()
     assert not work.status.mostly_collides
