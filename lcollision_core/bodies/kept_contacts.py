@@ -66,7 +66,7 @@ class Correspondence:
         """(V,) the limb of each of the body's vertices: a joint of the skeleton, or the trunk."""
         space, partner = self.retargeting.space, self.retargeting.partner.tolist()
         limb_of_joint = _limbs(space, partner, _trunk(space))
-        return limb_of_joint[_heaviest(space)]
+        return limb_of_joint[space.rig.heaviest]
 
     @cached_property
     def image(self) -> npt.NDArray[np.int64]:
@@ -87,7 +87,7 @@ class Correspondence:
         own_trunk = _trunk(source) | {
             at for at, number in enumerate(followed_numbers) if number in of_trunk
         }
-        theirs = _limbs(source, followed_numbers, own_trunk)[_heaviest(source)]
+        theirs = _limbs(source, followed_numbers, own_trunk)[source.rig.heaviest]
         image = np.full(len(theirs), -1, dtype=np.int64)
         between = axes_of(space.up, space.front) @ axes_of(source.up, source.front).T
         turns = _turns(source, self.source_motion, frame), _turns(space, self.motion, frame)
@@ -153,19 +153,11 @@ def _limbs(space: RigPoseSpace, known: Sequence[int], trunk: set[int]) -> npt.ND
     return limbs
 
 
-def _heaviest(space: RigPoseSpace) -> npt.NDArray[np.int64]:
-    rig = space.rig
-    heaviest: npt.NDArray[np.int64] = rig.joint_of[
-        np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)
-    ].astype(np.int64)
-    return heaviest
-
-
 def _first(space: RigPoseSpace, vertices: npt.NDArray[np.intp], limb: int) -> int:
     """Return the first joint of a limb's vertices; for the trunk, the root."""
     if limb == _TRUNK:
         return max(int(space.joint_of_code[0]), 0)
-    return int(_heaviest(space)[vertices].min())
+    return int(space.rig.heaviest[vertices].min())
 
 
 def _turns(space: RigPoseSpace, motion: Motion, frame: int) -> FloatArray:

@@ -488,8 +488,8 @@ def _ends(space: RigPoseSpace) -> FloatArray:
     """Return bone ends at rest relative to their joints, in the axes of `_Moved`: (J, 3)."""
     rig = space.rig
     axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
-    heaviest, rows = rig.weights.argmax(axis=1), np.arange(len(rig.weights))
-    owners, points = rig.joint_of[rows, heaviest], rig.points[rows, heaviest]
+    owners = rig.heaviest
+    points = rig.points[np.arange(len(owners)), rig.weights.argmax(axis=1)]
     ways = space.anatomy.axes[:, :, 1]
     along = np.einsum("vi,vi->v", points - rig.rest[owners, :3, 3], ways[owners])
     lengths = np.full(len(ways), 0.02 * space.body_size)

@@ -296,9 +296,10 @@ def joint_groups(character: Character) -> tuple[FaceGroup, ...]:
         return ()
     topology, rest = character.topology, character.rest_vertices
     size, centres = body_size(rest, topology), rig.rest[:, :3, 3]
-    main = rig.joint_of[np.arange(len(rest)), rig.weights.argmax(axis=1)]
     # Use numbers, as names may be truncated.
-    faces_of = {int(part.name): part.faces for part in part_groups(topology, main.astype(np.str_))}
+    faces_of = {
+        int(part.name): part.faces for part in part_groups(topology, rig.heaviest.astype(np.str_))
+    }
     parents = _linked_parents(rig, set(faces_of), _SAME_PLACE * size)
     middles = rest[topology.faces].mean(axis=1)
     thickness: dict[int, float] = {}

@@ -149,8 +149,6 @@ class _Body:
             for role in (Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN)
             for side in _SIDES
         )
-        rows = np.arange(len(rig.joint_of))
-        self._heaviest = rig.joint_of[rows, rig.weights.argmax(axis=1)]
         self._points = space.rest_vertices @ self._axes.T
         turning = set(space.joint_of_code[ROOT_CODES:].tolist())
         self.fingers = [
@@ -365,7 +363,7 @@ class _Body:
         height = hips[1] + wrist[1] * (self._places[upper][1] - hips[1])
         of_arms = [joint for joint, role in enumerate(self._space.roles) if role in _ARMS]
         level = np.abs(self._points[:, 1] - height) < _NEAR
-        trunk = self._points[level & ~np.isin(self._heaviest, of_arms)]
+        trunk = self._points[level & ~np.isin(self._space.rig.heaviest, of_arms)]
         wide = float(np.abs(trunk[:, 0] - hips[0]).max(initial=0.0))
         front = float(trunk[:, 2].max(initial=hips[2]))
         half = 0.5 * (front - float(trunk[:, 2].min(initial=hips[2])))
@@ -391,7 +389,7 @@ class _Body:
     def _thickness(self, joint: int, bone: int, place: FloatArray | None = None) -> float:
         """Return the skin's radius about a joint, across a bone's direction, at a place."""
         way = self._bones[bone][:, 1]
-        limb_points = self._points[self._heaviest == joint] - (
+        limb_points = self._points[self._space.rig.heaviest == joint] - (
             self._places[joint] if place is None else place
         )
         near = limb_points[np.abs(limb_points @ way) < _NEAR]

@@ -244,8 +244,7 @@ class RigPoseSpace:
 
         A joint whose part would lead no vertex belongs to its parent's part.
         """
-        heaviest = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)]
-        leading = {parts[joint] for joint in np.unique(heaviest)}
+        leading = {parts[joint] for joint in np.unique(rig.heaviest)}
         part_of: dict[int, str] = {}
         for joint in self._bones.tolist():
             name = parts[joint] if joint >= 0 else ""
@@ -261,7 +260,7 @@ class RigPoseSpace:
                 for bone in self._bone_of
             ]
         )
-        self.vertex_domain: npt.NDArray[np.intp] = part_of_joint[heaviest]
+        self.vertex_domain: npt.NDArray[np.intp] = part_of_joint[rig.heaviest]
         self.part_of_joint = part_of_joint
         # A virtual root has no part.
         self._root_part = int(part_of_joint[self._bones[0]]) if self._bones[0] >= 0 else -1
@@ -442,9 +441,8 @@ class RigPoseSpace:
     @cached_property
     def limbs(self) -> Limbs:
         """The tree of the joints that have codes; `Limbs.leads` are the heaviest influences."""
-        n_bones, rig = len(self._bones), self.rig
-        heaviest = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)]
-        leads = np.maximum(self._bone_of[heaviest], 0)
+        n_bones = len(self._bones)
+        leads = np.maximum(self._bone_of[self.rig.heaviest], 0)
         lengths, sizes = np.zeros(n_bones), np.ones(n_bones, dtype=np.int64)
         for bone in range(n_bones - 1, -1, -1):
             below = self._carried[:, bone]

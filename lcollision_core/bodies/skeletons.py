@@ -112,13 +112,12 @@ class Skeleton:
         places, roots = rig.rest[:, :3, 3], rig.parents < 0
         self._places: FloatArray = np.concatenate([places, [places[roots].mean(axis=0)]])
         largest = rig.weights.argmax(axis=1)
-        heaviest = rig.joint_of[rows, largest]
-        self._skin = np.bincount(heaviest, minlength=n_joints)
+        self._skin = np.bincount(rig.heaviest, minlength=n_joints)
         used = np.bincount(rig.joint_of[rig.weights > 0.0], minlength=n_joints) > 0
         # A last bone points to the centre of its skin.
         self._tips = self._places.copy()
         for joint in np.flatnonzero(self._skin).tolist():
-            self._tips[joint] = rig.points[rows, largest][heaviest == joint].mean(axis=0)
+            self._tips[joint] = rig.points[rows, largest][rig.heaviest == joint].mean(axis=0)
         self._children: list[list[int]] = [[] for _ in self._parents]
         self._reach, self._next = np.zeros(n_joints + 1), [-1] * (n_joints + 1)
         self._shares = np.append(self._skin, 0) / max(1, len(rows))
@@ -576,7 +575,6 @@ def bone_directions(rig: Rig, origins: FloatArray, roles: Sequence[Role]) -> Flo
     """
     size = float(np.ptp(origins, axis=0).max()) + float(np.ptp(rig.points, axis=(0, 1)).max())
     directions = np.zeros_like(origins)
-    heaviest = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)]
     next_of = limb_children(rig, roles)
     for joint, parent in enumerate(rig.parents):
         following = rig.parents == joint
@@ -584,7 +582,7 @@ def bone_directions(rig: Rig, origins: FloatArray, roles: Sequence[Role]) -> Flo
             following = np.arange(len(origins)) == next_of[joint]
         ends = origins[following] - origins[joint]
         ends = ends[np.linalg.norm(ends, axis=1) > _SHORT * size]
-        led = np.flatnonzero(heaviest == joint)
+        led = np.flatnonzero(rig.heaviest == joint)
         if len(ends):
             way = ends.mean(axis=0)
         elif len(led):

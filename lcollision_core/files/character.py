@@ -248,6 +248,13 @@ class Rig:
     file_parents: npt.NDArray[np.int64] | None = None
     shapes: Shapes | None = None
 
+    @cached_property
+    def heaviest(self) -> npt.NDArray[np.int32]:
+        """(V,) int32 array, the joint with the largest weight in each vertex."""
+        rows, largest = np.arange(len(self.joint_of)), self.weights.argmax(axis=1)
+        joints: npt.NDArray[np.int32] = self.joint_of[rows, largest]
+        return joints
+
     @property
     def own_parents(self) -> npt.NDArray[np.int64]:
         """(J,) int64 array, each joint's parent in the file."""

@@ -76,8 +76,7 @@ def with_ends_on_limbs(
     rig : its joints may be in another order; see `Rig.file_parents`
     notes : a sentence that names the ends, if there are any
     """
-    parents = rig.parents.tolist()
-    led_by = rig.joint_of[np.arange(len(rest_vertices)), rig.weights.argmax(axis=1)]
+    parents, led_by = rig.parents.tolist(), rig.heaviest
     carries = np.eye(len(parents), dtype=np.bool_)
     for joint in range(len(parents) - 1, -1, -1):
         if parents[joint] >= 0:
