@@ -193,7 +193,8 @@ class MainWindow(EditorWindow):
 
     def _connect(self) -> None:
         document = self.document
-        self.bodies.hidden_changed.connect(self.viewport.hide_faces)
+        for hide in (self.viewport.hide_faces, self.library.hide_faces):
+            self.bodies.hidden_changed.connect(hide)
         self.bodies.save_wanted.connect(lambda: self.attempt(self.files.save_scene))
         self.bodies.clip_wanted.connect(
             lambda *wanted: self.attempt(partial(self.files.play_clip, *wanted))
@@ -269,6 +270,7 @@ class MainWindow(EditorWindow):
         if self.bodies.scene is not None:
             # For a single body, `HiddenMeshes` decides what is drawn.
             self.viewport.hide_faces(self.bodies.hidden_faces)
+            self.library.hide_faces(self.bodies.hidden_faces)
         self._update_title()
 
     @Slot()

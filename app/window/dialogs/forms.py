@@ -509,8 +509,9 @@ class SceneExportDialog(_FrameForm):
         form = self.form.currentData()
         for field in (self.axes, self._scale):
             field.setEnabled(form not in ("own", "glb"))
-        own = "Each file keeps its textures, rig, axes and unit. "
-        self._about.setText(own if form == "own" else _GLB if form == "glb" else _FOLLOWS)
+        own = "Each file keeps its textures, rig, axes and unit."
+        about = own if form == "own" else _GLB if form == "glb" else _FOLLOWS
+        self.explain(self._about, about)
 
 
 class MotionDialog(_FrameForm):

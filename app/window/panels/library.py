@@ -502,7 +502,8 @@ class LibraryPanel(QWidget):
     def _picture(self, pose: NamedPose) -> QIcon:
         model = self._document.model
         device_pixel_ratio = self.devicePixelRatioF()
-        posed_vertices = vertices = model.decode(pose.latent, 1).astype(np.float32)
+        vertices = model.decode(pose.latent, 1).astype(np.float32)
+        posed_vertices = model.without_ground(vertices)
         faces = model.faces if self._hidden is None else model.faces[~self._hidden]
         if pose.moves is not None:
             # For a hand pose, show one hand, large enough to be seen.

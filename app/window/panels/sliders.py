@@ -405,6 +405,7 @@ class SliderGroup(QWidget):
         self._domain = index - 1 if 0 < index <= n_domains else None
         self._open_before: bool | None = None
         self.rows: list[CodeRow] = []
+        self._captions: list[QWidget] = []
         self.header = GroupHeader(heading(group.name), group.colour or "", self._domain)
         self._body = QWidget()
         self._column = vbox(spacing=0, margins=(0, 0, 0, TIGHT))
@@ -444,14 +445,26 @@ class SliderGroup(QWidget):
             self._open_before = None
         for row, matches_all in zip(self.rows, matches, strict=False):
             row.setVisible(matches_all)
+        for caption in self._captions:
+            caption.setVisible(not words)
         self.setVisible(any(matches))
         return any(matches)
 
     def _make_rows(self) -> None:
+        from lcollision_core.bodies import as_scene
+
         document, codes = self._panel.document, self._group.codes
         name_width = longest_name(self, map(heading, document.model.code_names[codes]))
         order: list[QWidget] = [self.header.button]
+        # In a scene, the sliders of several bodies have the same names.
+        names_bodies, body = self._domain is None and as_scene(document.model) is not None, ""
         for index, code in enumerate(range(codes.start, codes.stop)):
+            of_body, colon, _ = document.model.code_names[code].rpartition(": ")
+            if names_bodies and colon and of_body != body:
+                body, caption = of_body, labelled(heading(of_body), "caption")
+                caption.setContentsMargins(TIGHT, TIGHT, 0, 0)
+                self._column.addWidget(caption)
+                self._captions.append(caption)
             row = CodeRow(document, code, index, self._domain, name_width)
             row.hovered.connect(self._panel.domain_hovered)
             row.menu_wanted.connect(self._panel.menu_wanted)

@@ -109,7 +109,7 @@ def test_a_folder_of_motions_of_many_shapes(
         assert rows[name]["free_after"] == rows[name]["frames"]
         with np.load(walks / name) as old, np.load(out / name) as new:
             assert new.files == old.files
-    assert "does not turn jaw, left eye, right eye" in result.stderr
+    assert "has no rotations for jaw, left eye, right eye" in result.stderr
 
 
 @pytest.mark.slow

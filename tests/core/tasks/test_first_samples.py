@@ -128,7 +128,7 @@ def test_after_that_parts_can_be_left_out_under_the_same_name(
     with pytest.raises(MostlyCollidingError):
         learn_model(work)
     work.prepare(replace(request, ignored=None))
-    with pytest.raises(LabelStoreError, match=r"0 of the .* rows to train on collide"):
+    with pytest.raises(LabelStoreError, match=r"0 of .* training rows collide"):
         learn_model(work)
     assert LearnedBody.load(work.embedding).rules.touching
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import numpy.typing as npt
 import pytest
 import pyvista
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QDialog, QFileDialog, QMessageBox, QToolButton
+from PySide6.QtGui import QImage
+from PySide6.QtWidgets import QDialog, QFileDialog, QLabel, QMessageBox, QToolButton
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
@@ -31,6 +33,13 @@ from tests.rigged_shapes import rigged_body, write_gltf
 def hero(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a character."""
     return write_gltf(rigged_body(), tmp_path_factory.mktemp("body") / "hero.glb")
+
+
+def opaque(picture: QImage) -> float:
+    """Return the share of a picture's pixels that are drawn on."""
+    places = itertools.product(range(picture.width()), range(picture.height()))
+    alphas = [picture.pixelColor(x, y).alpha() for x, y in places]
+    return sum(alpha > 127 for alpha in alphas) / len(alphas)
 
 
 def offers_to_learn(window: MainWindow) -> list[bool]:
@@ -61,6 +70,10 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
     document, tree = window.document, window.bodies.tree
     assert window.docks["bodies"].isVisible()
     assert offers_to_learn(window) == [False]
+    whole_body = window.sliders.groups[0]
+    whole_body.set_open(True)
+    captions = [one.text() for one in whole_body.findChildren(QLabel) if not one.isHidden()]
+    assert [one for one in captions if one in ("Hero", "Hero 2")] == ["Hero", "Hero 2"]
     rows = [tree.topLevelItem(row) for row in range(tree.topLevelItemCount())]
     assert [row.text(0) for row in rows if row is not None] == ["hero", "hero 2"]
     second = tree.topLevelItem(1)
@@ -187,6 +200,9 @@ def test_the_ground_counts_where_it_is_wanted(qtbot: QtBot, hero: Path, tmp_path
     assert hidden is not None
     np.testing.assert_array_equal(np.flatnonzero(hidden), np.r_[scene.faces_of["ground"]])
     assert len(scene.without_ground(scene.reference)) == scene.n_vertices - 4
+    # Its thumbnails show the body, which fills a part of them, and no ground.
+    picture = window.library._picture(document.history.pose).pixmap(64, 64).toImage()
+    assert 0.03 < opaque(picture) < 0.6
     # The pose is the same, but now penetrates the ground.
     np.testing.assert_array_equal(document.history.latent, sunk)
     assert not scene.exact_check().is_free(sunk)
