@@ -217,7 +217,7 @@ def test_arms_are_crossed_by_mouse_alone(qtbot: QtBot, body_window: MainWindow) 
     take_picture(body_window, "arms crossed, before")
     hand.choose_in_bar("Pose", "Pin feet")
     hand.choose_in_bar("Pose", "Pin hands")
-    hand.choose_in_bar("Pose", "Whole body helps")
+    hand.choose_in_bar("Pose", "Move whole body")
     hand.look_from("Front")
     # The hands are the highest pins; the body's left is at positive x.
     places = {pin.vertex: pin.position for pin in document.history.pose.pins}
