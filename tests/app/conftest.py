@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,6 @@ from app.work.preparing import prepare, warm_up
 from lcollision_core.bodies import LearnedBody, find_model, sample_poses
 from lcollision_core.files import locked
 from lcollision_core.jobs import Job
-from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
 from tests.app.views import SIDE, dispose, rest
 from tests.app.windows import (
@@ -114,7 +115,10 @@ def editor_model(tmp_path_factory: pytest.TempPathFactory) -> LearnedBody:
     path.parent.mkdir(exist_ok=True)
     with locked(path, wait=PATIENCE / 1000):
         if not path.exists():
-            trained_tube().save(path)
+            # In a process without a window: triton and Mesa's LLVM crash in one.
+            code = "from tests.app.editor_model import trained_tube as make; make().save({!r})"
+            root = Path(__file__).parents[2]
+            subprocess.run([sys.executable, "-c", code.format(str(path))], cwd=root, check=True)
     model = LearnedBody.load(path)
     warm_up(model)
     return model
