@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from lcollision_core.files import PoseSet
     from lcollision_core.tasks.exporting import Output
 
+_OF_MOTIONS = (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES)
+
 PARTIAL = "motions.partial.json"
 """Name of the progress file in a folder of results."""
 
@@ -48,8 +50,9 @@ PARTIAL = "motions.partial.json"
 def holds_motion(path: Path) -> bool:
     """Whether a file holds a motion and no mesh, or a folder only such files."""
     if path.is_dir():
-        return not mesh_files(path)[0] and bool(motion_files(path))
-    of_kind = path.suffix.lower() in (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES)
+        inside = (file for file in path.rglob("*") if file.is_file())
+        return not mesh_files(path)[0] and any(map(_may_hold_motion, inside))
+    of_kind = path.suffix.lower() in _OF_MOTIONS
     return of_kind or is_generated(path) or is_smpl_motion(path)
 
 
@@ -106,13 +109,10 @@ def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None
     files: list[Path] = []
     others: list[Path] = []
     for path in sorted(inside, key=lambda path: [natural_key(Path(part)) for part in path.parts]):
-        suffix = path.suffix.lower()
-        if suffix in (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES):
+        if _may_hold_motion(path):
             files.append(path)
-        elif suffix in (".npz", ".json", ".npy"):
-            (files if _may_hold_motion(path) else others).append(path)
-        elif _has_clips(path):
-            files.append(path)
+        elif path.suffix.lower() in (".npz", ".json", ".npy"):
+            others.append(path)
     places = [path for path in files if path.suffix.lower() == ".npy"]
     if len(places) < len(files):
         # Generators write joint positions beside the motion, which also has the rotations.
@@ -148,8 +148,10 @@ def _inside(folder: Path, besides: Path | None) -> Callable[[Path], bool]:
 
 
 def _may_hold_motion(path: Path) -> bool:
-    """Whether a file may hold poses or rotations; its errors are reported in its row."""
+    """Whether a file may hold poses, rotations or clips; its errors are reported in its row."""
     suffix = path.suffix.lower()
+    if suffix in _OF_MOTIONS:
+        return True
     if suffix == ".json":
         try:
             content = json.loads(path.read_bytes())
@@ -158,12 +160,11 @@ def _may_hold_motion(path: Path) -> bool:
         return isinstance(content, dict) and "poses" in content
     if suffix == ".npy":
         return holds_joints(path)
-    if is_generated(path):
-        return True
     if suffix == ".npz":
         names = array_names(path)
-        return not names or is_smpl_motion(path) or bool({"vertices", "V"} & set(names))
-    return False
+        has_meshes = bool({"vertices", "V"} & set(names))
+        return not names or has_meshes or is_generated(path) or is_smpl_motion(path)
+    return _has_clips(path)
 
 
 def _has_clips(path: Path) -> bool:
