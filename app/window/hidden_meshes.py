@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -47,7 +47,7 @@ class HiddenMeshes(QObject):
         window: QWidget,
         document: PoseDocument,
         settings: Settings,
-        draw: Sequence[Callable[[npt.NDArray[np.bool_] | None], None]],
+        draw: Callable[[npt.NDArray[np.bool_] | None], None],
         attempt: Callable[[Callable[[], object]], object],
     ) -> None:
         super().__init__(window)
@@ -116,8 +116,7 @@ class HiddenMeshes(QObject):
             for group in self.meshes:
                 if group.name in hidden:
                     faces[group.faces] = True
-        for draw in self._draw:
-            draw(faces)
+        self._draw(faces)
 
     def _fill(self) -> None:
         hidden = self.hidden

@@ -44,6 +44,9 @@ from app.work.preparing import Preparing
 from lcollision_core.tasks.words import one_line
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from app.editing.document import PoseDocument
     from app.editing.recovery import Autosave, RecoverablePose
     from lcollision_core.meshes import Topology
@@ -104,7 +107,7 @@ class MainWindow(EditorWindow):
             self,
             document,
             settings,
-            (self.viewport.hide_faces, self.library.hide_faces),
+            self._hide_faces,
             self.attempt,
         )
         self.learning = LearningActions(self, document, self.files, self._status, self.attempt)
@@ -193,8 +196,7 @@ class MainWindow(EditorWindow):
 
     def _connect(self) -> None:
         document = self.document
-        for hide in (self.viewport.hide_faces, self.library.hide_faces):
-            self.bodies.hidden_changed.connect(hide)
+        self.bodies.hidden_changed.connect(self._hide_faces)
         self.bodies.save_wanted.connect(lambda: self.attempt(self.files.save_scene))
         self.bodies.clip_wanted.connect(
             lambda *wanted: self.attempt(partial(self.files.play_clip, *wanted))
@@ -269,9 +271,14 @@ class MainWindow(EditorWindow):
             self.viewport.set_shading(remembered_shading(self))
         if self.bodies.scene is not None:
             # For a single body, `HiddenMeshes` decides what is drawn.
-            self.viewport.hide_faces(self.bodies.hidden_faces)
-            self.library.hide_faces(self.bodies.hidden_faces)
+            self._hide_faces(self.bodies.hidden_faces)
         self._update_title()
+
+    @Slot(object)
+    def _hide_faces(self, hidden: npt.NDArray[np.bool_] | None) -> None:
+        """Hide faces, a (F,) bool array or None, in the view and in thumbnails."""
+        self.viewport.hide_faces(hidden)
+        self.library.hide_faces(hidden)
 
     @Slot()
     def _on_frame(self) -> None:
