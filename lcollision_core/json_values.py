@@ -11,6 +11,8 @@ from typing import Any, NoReturn, TypeVar
 
 from msgspec import ValidationError, convert
 
+from lcollision_core.errors import ModelFileError
+
 MAX_MEMORY = 2**29
 """Most bytes that the values of one document may take."""
 
@@ -37,6 +39,28 @@ def parse_json(content: bytes) -> Any:
         return json.loads(content.decode("utf-8-sig"), parse_constant=_refuse_constant)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
+
+
+def parse_document(content: bytes, kind: str, version: int, where: object) -> dict[str, Any]:
+    """Parse a JSON object that names its format and version.
+
+    Parameters
+    ----------
+    kind, version : the format, and the latest version that is known
+    where : the file, for messages
+
+    Raises
+    ------
+    ValueError : it is no JSON, or of another format.
+    ModelFileError : it is of a later version.
+    """
+    document = parse_json(content)
+    if not isinstance(document, dict) or document.get("format") != kind:
+        raise ValueError("it contains something else")
+    stored = document.get("format_version")
+    if isinstance(stored, int) and stored > version:
+        raise ModelFileError.too_new(where, quoted(stored), version)
+    return document
 
 
 def from_json(cls: type[T], values: Any, name: str) -> T:

@@ -34,7 +34,7 @@ from lcollision_core.files.safe import atomic_write, read_regular
 from lcollision_core.files.scene.smpl import refuse_pickle
 from lcollision_core.files.scene_files import SceneDocument, open_scene
 from lcollision_core.files.table import SCENE_SUFFIXES, SMPL_SUFFIX
-from lcollision_core.json_values import from_json, parse_json, quoted
+from lcollision_core.json_values import from_json, parse_document
 from lcollision_core.meshes import ContactRules, Topology
 from lcollision_core.meshes.topology import FloatArray
 
@@ -91,12 +91,7 @@ def known_character(fingerprint: str) -> RememberedChoices | None:
     """
     path = _path(fingerprint)
     try:
-        document = parse_json(read_regular(path, _MAX_BYTES))
-        if not isinstance(document, dict) or document.get("format") != _FORMAT:
-            raise ValueError("it contains something else")
-        version = document.get("format_version")
-        if isinstance(version, int) and version > _VERSION:
-            raise ModelFileError.too_new(path, quoted(version), _VERSION)
+        document = parse_document(read_regular(path, _MAX_BYTES), _FORMAT, _VERSION, path)
         return from_json(RememberedChoices, document, "the character")
     except FileNotFoundError:
         return None

@@ -24,7 +24,7 @@ from lcollision_core.files import Character, Rig, read_character, read_mesh
 from lcollision_core.files.character import ClipFrames
 from lcollision_core.files.safe import atomic_write, read_regular
 from lcollision_core.files.table import READABLE_SUFFIXES, SCENE_SUFFIXES, SMPL_SUFFIX
-from lcollision_core.json_values import from_json, parse_json, quoted
+from lcollision_core.json_values import from_json, parse_document, parse_json
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.upright import guess_up
@@ -70,12 +70,8 @@ def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
     """
     target = Path(path)
     try:
-        document = parse_json(read_regular(target, _MAX_BYTES))
-        if not isinstance(document, dict) or document.get("format") != SCENE_FORMAT:
-            raise ValueError("it contains something else")
-        version = document.get("format_version")
-        if isinstance(version, int) and version > _VERSION:
-            raise ModelFileError.too_new(target, quoted(version), _VERSION)
+        content = read_regular(target, _MAX_BYTES)
+        document = parse_document(content, SCENE_FORMAT, _VERSION, target)
         scene = from_json(SceneFile, document, "the scene")
     except FileNotFoundError as error:
         raise ModelFileError.unreadable(target, "there is no such file", "name a scene") from error
