@@ -8,10 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import ClearanceOption, note_rules
-from app.cli.inputs import ThreadsOption
-from app.cli.interrupt import cancel_on_interrupt
+from app.cli.console import (
+    JsonOption,
+    cancel_on_interrupt,
+    cancellable_bar,
+    note,
+    print_json,
+    progress_bar,
+    tell,
+)
+from app.cli.contacts import note_rules
+from app.cli.inputs import ClearanceOption, ThreadsOption
 from app.cli.models import measured_model, measured_model_sentence
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
@@ -90,7 +97,7 @@ def predictor(
 
     model = LearnedBody.load(model_name)
     trained = model.require_predictor()
-    with cancel_on_interrupt() as job, progress_bar("Timing exact checks", job) as job:
+    with cancellable_bar("Timing exact checks") as job:
         rows = time_predictor(model, trained, n_poses, job)
     if as_json:
         print_json([measured_model(model) | row for row in rows])
@@ -210,7 +217,7 @@ def drag(
     from lcollision_core.bodies import open_body
 
     model = open_body(model_name)
-    with cancel_on_interrupt() as job, progress_bar("Dragging", job) as job:
+    with cancellable_bar("Dragging") as job:
         rows = time_drags(model, n_targets, job=job)
     if as_json:
         print_json(
@@ -243,7 +250,7 @@ def cores(
     from lcollision_core.jobs import available_cores
 
     loops = loops_of(open_body(model_name), n_poses, data)
-    with cancel_on_interrupt() as job, progress_bar("Timing loops", job) as job:
+    with cancellable_bar("Timing loops") as job:
         rows = time_cores(loops, workers or available_cores(), job)
     _print_rows(rows, as_json)
 
@@ -270,7 +277,7 @@ def gpu(
     from lcollision_core.files import read_pose_set
 
     choose_device(Device.CUDA)
-    with cancel_on_interrupt() as job, progress_bar("Comparing devices", job) as job:
+    with cancellable_bar("Comparing devices") as job:
         if data is None:
             rows = time_gpu(open_body(model_name), n_poses, job)
         else:
@@ -302,7 +309,7 @@ def motion(
 
     model = open_body(model_name)
     rows: list[Row] = []
-    with cancel_on_interrupt() as job, progress_bar("Resolving frames", job) as job:
+    with cancellable_bar("Resolving frames") as job:
         for measured in motions_of(model, data):
             rows += score_motion(model, measured, workers, job)
     if as_json:
@@ -331,7 +338,7 @@ def contacts(
     """
     from app.benchmarks.contacts import contact_rows
 
-    with cancel_on_interrupt() as job, progress_bar("Resolving frames", job) as job:
+    with cancellable_bar("Resolving frames") as job:
         rows = contact_rows(files or [], workers, job)
     _print_rows(rows, as_json)
 
@@ -347,7 +354,7 @@ def printing(
     """Print random poses, and check the files with independent programs."""
     from app.benchmarks.printing import printed_rows
 
-    with cancel_on_interrupt() as job, progress_bar("Printing poses", job) as job:
+    with cancellable_bar("Printing poses") as job:
         rows = printed_rows(model_names, n_poses, job)
     _print_rows(rows, as_json)
 

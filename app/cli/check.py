@@ -7,10 +7,25 @@ from typing import Annotated
 
 import typer
 
-from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import ClearanceOption, NoRulesOption, RestOption, TouchOption
-from app.cli.inputs import DeviceOption, ErrorBoundOption, JointsOption, MeshesArgument
-from app.cli.interrupt import cancel_on_interrupt
+from app.cli.console import (
+    ExitStatus,
+    JsonOption,
+    cancel_on_interrupt,
+    note,
+    print_json,
+    progress_bar,
+    tell,
+)
+from app.cli.inputs import (
+    ClearanceOption,
+    DeviceOption,
+    ErrorBoundOption,
+    JointsOption,
+    MeshesArgument,
+    NoRulesOption,
+    RestOption,
+    TouchOption,
+)
 from app.cli.options import refuse_given, takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
@@ -88,12 +103,7 @@ def check(
     choose_device(device, note)
     from lcollision_core.files import require_writable
     from lcollision_core.files.safe import atomic_write
-    from lcollision_core.tasks.checking import (
-        CheckRequest,
-        check_clips,
-        check_mesh,
-        table_of,
-    )
+    from lcollision_core.tasks.checking import CheckRequest, check_clips, check_mesh, table_of
     from lcollision_core.tasks.inputs import holds_motion, mesh_files_of, motion_files_of
 
     as_clips = [clips or holds_motion(path) for path in meshes]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -80,6 +81,32 @@ def progress_bar(task: str, job: Job | None = None) -> Iterator[Job]:
         return
     with _bar(task, "count", "time") as show:
         yield job.part(lambda done, total: show(done, total, task, []))
+
+
+@contextmanager
+def cancel_on_interrupt() -> Iterator[Job]:
+    """Yield a job that the first Ctrl-C or SIGTERM cancels; a second one acts at once."""
+    job = Job(note=note)
+    previous: dict[signal.Signals, Any] = {}
+
+    def stop(number: int, frame: object) -> None:  # noqa: ARG001
+        job.cancel()
+        signal.signal(number, previous[signal.Signals(number)])
+
+    for caught in (signal.SIGINT, signal.SIGTERM):
+        previous[caught] = signal.signal(caught, stop)
+    try:
+        yield job
+    finally:
+        for caught, handler in previous.items():
+            signal.signal(caught, handler)
+
+
+@contextmanager
+def cancellable_bar(task: str) -> Iterator[Job]:
+    """Yield a job with a progress bar, which the first Ctrl-C or SIGTERM cancels."""
+    with cancel_on_interrupt() as job, progress_bar(task, job) as part:
+        yield part
 
 
 @contextmanager

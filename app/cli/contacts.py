@@ -1,4 +1,4 @@
-"""``lcollision contacts``: which pairs of faces a model or a character does not count."""
+"""``lcollision contacts``: which pairs of faces do not count, and how commands report that."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import JsonOption, print_json, progress_bar, tell
-from app.cli.contact_options import excluded_at_rest, rules_json, rules_sentence
-from app.cli.models import ModelArgument, keep_rules
+from app.cli.console import JsonOption, note, print_json, progress_bar, tell
+from app.cli.inputs import ModelArgument
 from app.cli.options import takes_options
 from lcollision_core.options import RuleOptions
 from lcollision_core.tasks.words import counted
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import ProposedRules
+    from lcollision_core.bodies import Body, ProposedRules
+    from lcollision_core.meshes import ContactRules
 
 
 @takes_options
@@ -77,3 +77,45 @@ def _proposed_json(proposed: ProposedRules | None) -> dict[str, Any] | None:
         "colliding": proposed.n_colliding,
         "colliding_then": proposed.n_colliding_then,
     }
+
+
+def keep_rules(name: str, body: Body, rules: ContactRules) -> None:
+    """Store new contact rules of a body, if they differ, and report it."""
+    from lcollision_core.tasks.changing import require_changeable, set_rules
+
+    if rules == body.rules:
+        return
+    if body.is_trained:
+        name = str(require_changeable(name))
+    set_rules(body, name, rules)
+    note(f"the contact rules of {body.name} have changed")
+
+
+def note_rules(body: Body) -> None:
+    """Print which pairs of faces the figures leave out, and how many there are at rest."""
+    if body.rules_are_chosen:
+        note(f"{body.name} uses the contact rules that you chose")
+    if not body.rules.exclude_nothing:
+        note(rules_sentence(body.rules, excluded_at_rest(body)))
+
+
+def rules_sentence(rules: ContactRules, at_rest: dict[str, int]) -> str:
+    """Describe the rules, and how many pairs each one excludes at rest."""
+    from lcollision_core.meshes import RuleCounts
+
+    said = RuleCounts(**at_rest).described()
+    return f"not counted: {rules.described()}; at rest: {said or 'no pair'}"
+
+
+def excluded_at_rest(body: Body) -> dict[str, int]:
+    """Return how many pairs of the rest pose each rule excludes, as JSON values."""
+    from lcollision_core.meshes import RuleCounts
+
+    if body.rules.exclude_nothing:
+        return RuleCounts().to_json()
+    return body.detector.detect(body.reference).excluded.to_json()
+
+
+def rules_json(body: Body) -> dict[str, Any]:
+    """Return the JSON fields of the contact rules, and how many pairs they exclude at rest."""
+    return {"rules": body.rules.to_json(), "excluded_at_rest": excluded_at_rest(body)}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import rules_sentence
+from app.cli.contacts import rules_sentence
 from app.cli.inputs import Axis, PoseSetArgument, up_sentence
 from app.cli.options import refuse_given, takes_options
 from lcollision_core.errors import LCollisionError

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from app.cli.models import keep_rules
+from app.cli.contacts import keep_rules
 from app.cli.options import takes_options
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options import NO_CHANGE, RuleOptions

@@ -11,14 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import JsonOption, note, print_json, progress_bar, tell
-from app.cli.inputs import DeviceOption, RowsOption
-from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import (
-    ModelArgument,
-    measured_model,
-    measured_model_sentence,
-)
+from app.cli.console import JsonOption, cancellable_bar, note, print_json, tell
+from app.cli.inputs import DeviceOption, ModelArgument, RowsOption
+from app.cli.models import measured_model, measured_model_sentence
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError
 from lcollision_core.tasks.words import counted
@@ -114,12 +109,12 @@ def evaluate(
     if keep:
         require_changeable(model_name)
     rows, numbers = _unseen(store, store.load(n_rows), trained)
-    with cancel_on_interrupt() as job, progress_bar("Evaluating", job) as job:
+    with cancellable_bar("Evaluating") as job:
         scored = score_rows(trained, rows, job=job)
     metrics = scored.metrics(threshold)
     kinds: tuple[KindScores, ...] = ()
     if n_of_kind:
-        with cancel_on_interrupt() as job, progress_bar("Judging kinds of poses", job) as job:
+        with cancellable_bar("Judging kinds of poses") as job:
             kinds = score_kinds(model, n_of_kind, job=job, threshold=threshold)
     if keep:
         measured_by = replace(trained, metrics=metrics, kinds=kinds or trained.kinds)

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
 Axis = Literal["x", "y", "z"]
 
+ModelArgument = Annotated[
+    str,
+    typer.Argument(metavar="M", help="The file of a model or a character, or a model's name."),
+]
 MeshesArgument = Annotated[
     list[Path],
     # readable=False: read_mesh reports the error and the file itself.
@@ -81,7 +85,37 @@ ScaleOption = Annotated[
         "Results are in the meshes' own unit.",
     ),
 ]
-
+RestOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="MESH",
+        readable=False,
+        help="The rest pose of the meshes: body size and distances are measured on it, and pairs "
+        "that touch in it are not counted.",
+    ),
+]
+ClearanceOption = Annotated[
+    float,
+    typer.Option(
+        "--clearance",
+        metavar="C",
+        min=0.0,
+        max=1.0,
+        help="Distance to keep between parts, in body sizes: faces that are nearer count as "
+        "colliding. Parts near at rest may come to half their rest distance.",
+    ),
+]
+TouchOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="A:B",
+        help="With --clearance, these two groups of faces may touch: meshes, materials, body parts "
+        "or components. May be repeated.",
+    ),
+]
+NoRulesOption = Annotated[
+    bool, typer.Option("--no-rules", help="Count all pairs and ignore the character's rules.")
+]
 
 PosesOutput = Annotated[
     Path, typer.Option("--output", "-o", metavar="POSES", help="The .json file to write.")

@@ -10,12 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, status_bar, tell
-from app.cli.contact_options import excluded_at_rest, note_rules
+from app.cli.console import (
+    ExitStatus,
+    JsonOption,
+    cancel_on_interrupt,
+    cancellable_bar,
+    note,
+    print_json,
+    status_bar,
+    tell,
+)
+from app.cli.contacts import excluded_at_rest, note_rules
 from app.cli.evaluate import open_store
-from app.cli.inputs import DeviceOption, ThreadsOption
-from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import ModelArgument, measured_model, measured_model_sentence
+from app.cli.inputs import DeviceOption, ModelArgument, ThreadsOption
+from app.cli.models import measured_model, measured_model_sentence
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError
 from lcollision_core.options import SampleDistribution
@@ -140,7 +148,7 @@ def label(
 def _check(model: LearnedBody, path: Path, as_json: bool) -> None:
     """Verify that the rows of a store read back as labelled, and report damage."""
     store = open_store(path, model)
-    with cancel_on_interrupt() as job, progress_bar("Reading", job) as job:
+    with cancellable_bar("Reading") as job:
         damaged = store.check(job)
     n_sound = store.end - sum(map(len, damaged))
     if as_json:

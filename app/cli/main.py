@@ -23,7 +23,6 @@ from app.cli import (
     edit,
     evaluate,
     label,
-    mirror,
     models,
     new,
     poses,
@@ -128,8 +127,8 @@ for command in (
     *(models.models, models.info, models.domains, models.upright),
     contacts.contacts,
     check.check,
-    *(poses.encode, poses.decode, poses.sample),
-    *(mirror.mirror, resolve.resolve, label.label, evaluate.evaluate),
+    *(poses.encode, poses.decode, poses.sample, poses.mirror),
+    *(resolve.resolve, label.label, evaluate.evaluate),
     *(serve.serve, serve.blender_addon),
 ):
     app.command()(command)

@@ -9,22 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, tell
-from app.cli.contact_options import rules_json, rules_sentence
-from app.cli.inputs import Axis
+from app.cli.contacts import rules_json, rules_sentence
+from app.cli.inputs import Axis, ModelArgument
 from lcollision_core.errors import LCollisionError
 from lcollision_core.tasks.words import counted, duration_text, error_rates
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, LearnedBody
-    from lcollision_core.meshes import ContactRules
 
 _ERRORS = ("level1_mean", "mean", "max", "held_out_mean", "held_out_max", "pca_held_out_mean")
 _MASKS = ("connected_share", "domains_per_vertex")
-
-ModelArgument = Annotated[
-    str,
-    typer.Argument(metavar="M", help="The file of a model or a character, or a model's name."),
-]
 
 
 def models(
@@ -214,18 +208,6 @@ def upright(
     if up is not None:
         body = set_up_axis(body, model_name, "xyz".index(up))
     typer.echo(f"{body.name}: {'xyz'[body.up_axis]} is up")
-
-
-def keep_rules(name: str, body: Body, rules: ContactRules) -> None:
-    """Store new contact rules of a body, if they differ, and report it."""
-    from lcollision_core.tasks.changing import require_changeable, set_rules
-
-    if rules == body.rules:
-        return
-    if body.is_trained:
-        name = str(require_changeable(name))
-    set_rules(body, name, rules)
-    note(f"the contact rules of {body.name} have changed")
 
 
 def describe(model: Body) -> dict[str, Any]:

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.console import JsonOption, note, print_json, status_bar, tell
-from app.cli.contact_options import note_rules
+from app.cli.console import JsonOption, cancel_on_interrupt, note, print_json, status_bar, tell
+from app.cli.contacts import note_rules
 from app.cli.evaluate import kind_lines
 from app.cli.inputs import DeviceOption
-from app.cli.interrupt import cancel_on_interrupt
 from app.cli.options import takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LCollisionError

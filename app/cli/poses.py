@@ -1,30 +1,43 @@
-"""``lcollision encode``, ``decode`` and ``sample``: latent poses from and to meshes, or random."""
+"""``lcollision encode``, ``decode``, ``sample`` and ``mirror``: make and convert latent poses."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import note, progress_bar, tell
-from app.cli.contact_options import ClearanceOption, TouchOption
+from app.cli.console import (
+    ExitStatus,
+    JsonOption,
+    cancellable_bar,
+    note,
+    print_json,
+    progress_bar,
+    tell,
+)
+from app.cli.contacts import note_rules
 from app.cli.inputs import (
+    ClearanceOption,
     DeviceOption,
     ErrorBoundOption,
     FormOutput,
     InPlaceOption,
     MeshesArgument,
+    ModelArgument,
     PosesArgument,
     PosesOutput,
     ScaleOption,
+    TouchOption,
 )
-from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import ModelArgument
 from app.cli.options import takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.jobs import Job
 from lcollision_core.options import NO_SCENE, ExportRequest, RuleOptions, SceneOptions
-from lcollision_core.tasks.words import fit_error
+from lcollision_core.tasks.words import counted, fit_error, mirrored_text
+
+if TYPE_CHECKING:
+    from lcollision_core.bodies import Body, MirroredPose
 
 
 def encode(
@@ -44,7 +57,7 @@ def encode(
 
     destination = require_output(output, ".json")
     model, files = open_body(model_name), mesh_files_of(meshes)
-    with cancel_on_interrupt() as job, progress_bar("Encoding meshes", job) as job:
+    with cancellable_bar("Encoding meshes") as job:
         poses = encode_meshes(model, files, destination, scale, job)
     for pose in poses:
         tell(f"{pose.name}: {fit_error(pose.fit_error_mean, pose.fit_error_max)}")
@@ -136,3 +149,64 @@ def sample(
     width = len(str(count))
     poses = [NamedPose(f"sample {index + 1:0{width}d}", row) for index, row in enumerate(latent)]
     write_result(destination, model, poses, job=Job(note=note))
+
+
+@takes_options
+def mirror(
+    model_name: ModelArgument,
+    poses: PosesArgument,
+    output: PosesOutput,
+    rules: RuleOptions,
+    in_place: InPlaceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Exchange left and right of poses, and mirror their placement.
+
+    Writes the pose nearest to each mirror image, with its fit error, under the same name.
+    Mirroring a pose twice restores it exactly. If a pose is free of collisions by the exact check
+    and its image is not, the image is resolved; exits with 1 if that fails.
+    """
+    from lcollision_core.bodies import open_body
+    from lcollision_core.tasks.exporting import refuse_to_replace, require_output, write_result
+    from lcollision_core.tasks.inputs import read_some_poses
+    from lcollision_core.tasks.mirroring import mirror_poses
+
+    destination = require_output(output, ".json")
+    refuse_to_replace([output], [poses], in_place=in_place)
+    model = open_body(model_name).with_options(rules)
+    named = read_some_poses(poses, model)
+    with cancellable_bar("Mirroring poses") as job:
+        images = mirror_poses(model, named, job)
+    written, *_ = write_result(destination, model, [pose for pose, _ in images], job=job)
+    mirrored_of = {f"{poses}: {pose.name}": mirrored for pose, mirrored in images}
+    if as_json:
+        rows = mirrored_of.items()
+        print_json([_row(model, source, written.path, mirrored) for source, mirrored in rows])
+    else:
+        for source, mirrored in mirrored_of.items():
+            tell(f"{source}: {mirrored_text(mirrored)}")
+        note_rules(model)
+    colliding = [source for source, mirrored in mirrored_of.items() if mirrored.collides_newly]
+    if colliding:
+        offer = (
+            f"run `lcollision resolve {model_name} {output}` or change them"
+            if model.has_predictor
+            else "the model has no predictor to resolve them with; run `lcollision label` and "
+            "`lcollision train predictor`"
+        )
+        count = counted(len(colliding), "free pose collides", "free poses collide")
+        note(f"{count} when mirrored, such as {colliding[0]}; {offer}")
+        raise typer.Exit(ExitStatus.ANSWER_IS_NO)
+
+
+def _row(model: Body, source: str, output: Path, mirrored: MirroredPose) -> dict[str, Any]:
+    names = ("restored", "fit_error_mean", "fit_error_max")
+    pairs = ("pairs_before", "pairs_mirrored", "pairs_after")
+    return {
+        "source": source,
+        "output": str(output),
+        **{name: getattr(mirrored, name) for name in (*names, *pairs)},
+        "exactly_free": mirrored.pairs_after == 0,
+        "resolved": mirrored.pairs_after == 0 < mirrored.pairs_mirrored,
+        "near_exclusion": model.rules.near_exclusion,
+    }

@@ -7,10 +7,8 @@ from typing import Annotated
 
 import typer
 
-from app.cli.console import ExitStatus, JsonOption, print_json, progress_bar, tell
-from app.cli.inputs import ScaleOption
-from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import ModelArgument
+from app.cli.console import ExitStatus, JsonOption, cancellable_bar, print_json, tell
+from app.cli.inputs import ModelArgument, ScaleOption
 from app.cli.options import takes_options
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options import NO_SCENE, PrintOptions, RuleOptions
@@ -61,7 +59,7 @@ def print_figure(
     require_print(output)
     model = open_scene(model_name, NO_SCENE).with_options(rules)
     refuse_to_replace([output], [pose, *source_files(model)])
-    with cancel_on_interrupt() as job, progress_bar("Making a solid", job) as job:
+    with cancellable_bar("Making a solid") as job:
         given, _ = read_input_poses(model, [pose], scale, job.part())
         if not given:
             raise typer.Exit(ExitStatus.BAD_INPUT)

@@ -13,23 +13,25 @@ from app.cli.console import (
     BarContent,
     ExitStatus,
     JsonOption,
+    cancel_on_interrupt,
+    cancellable_bar,
     note,
     print_json,
     progress_bar,
     status_bar,
     tell,
 )
-from app.cli.contact_options import TouchOption, excluded_at_rest, note_rules
+from app.cli.contacts import excluded_at_rest, note_rules
 from app.cli.inputs import (
     DeviceOption,
     FormOutput,
     InPlaceOption,
     JointsOption,
+    ModelArgument,
     ScaleOption,
     ThreadsOption,
+    TouchOption,
 )
-from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import ModelArgument
 from app.cli.options import Excluding, refuse_given, takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
@@ -198,11 +200,7 @@ def resolve(
     from lcollision_core.bodies.partners import with_joint_map
     from lcollision_core.tasks.exporting import output_named
     from lcollision_core.tasks.inputs import holds_motion
-    from lcollision_core.tasks.resolving import (
-        Remote,
-        ResolveMotionsRequest,
-        ResolvePosesRequest,
-    )
+    from lcollision_core.tasks.resolving import Remote, ResolveMotionsRequest, ResolvePosesRequest
     from lcollision_core.tasks.scenes import open_scene
 
     if sequence:
@@ -307,7 +305,7 @@ def _resolve_poses(
     require_request(output, body, poses, export)
     read = [*files, *source_files(body, export)]
     refuse_to_replace(files_of(output, body, poses, export), read, in_place=in_place)
-    with cancel_on_interrupt() as job, progress_bar("Resolving poses", job) as job:
+    with cancellable_bar("Resolving poses") as job:
         resolved = resolve_poses(replace(request, given=given), job)
     for resolved_pose in resolved:
         if resolved_pose.result.note:

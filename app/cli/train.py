@@ -11,22 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from app.cli.console import note, progress_bar, status_bar
+from app.cli.console import cancel_on_interrupt, note, progress_bar, status_bar
 from app.cli.evaluate import StoreArgument, kind_lines, open_store, scores_sentence
-from app.cli.inputs import (
-    Axis,
-    PoseSetArgument,
-    RowsOption,
-    up_sentence,
-)
-from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import (
-    ModelArgument,
-    describe,
-    error_sentence,
-    measured_model_sentence,
-    note_if_beside,
-)
+from app.cli.inputs import Axis, ModelArgument, PoseSetArgument, RowsOption, up_sentence
+from app.cli.models import describe, error_sentence, measured_model_sentence, note_if_beside
 from app.cli.options import takes_options
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import Job

@@ -26,12 +26,7 @@ from lcollision_core.meshes import STRICT
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
 from lcollision_core.options import NO_SCENE, MotionChoice, RuleOptions, SceneOptions
 from lcollision_core.tasks.inputs import body_of_motion
-from lcollision_core.tasks.scenes import (
-    is_scene_file,
-    parts_text,
-    scene_motion,
-    scene_of,
-)
+from lcollision_core.tasks.scenes import is_scene_file, parts_text, scene_motion, scene_of
 from lcollision_core.tasks.verdicts import CheckedClip, CheckedFrame, CheckedMesh
 from lcollision_core.tasks.words import say, say_number
 

@@ -423,12 +423,7 @@ def resolve_one(
     """Resolve one motion; its frames are named from `first` on in the run."""
     from lcollision_core.bodies import NamedPose
     from lcollision_core.bodies.motions import MotionChange, ground_facts
-    from lcollision_core.motion import (
-        MotionReport,
-        contact_report,
-        resolve_motion,
-        screen_motion,
-    )
+    from lcollision_core.motion import MotionReport, contact_report, resolve_motion, screen_motion
 
     start, body, options = time.perf_counter(), request.body, request.options
     substeps, workers = request.choice.substeps, request.workers

@@ -16,12 +16,7 @@ from typing import Any
 
 from lcollision_core.bodies import LearnedBody, list_models, user_models_folder
 from lcollision_core.bodies.learned_body import WORK_SUFFIX, work_path
-from lcollision_core.errors import (
-    FileLockedError,
-    LCollisionError,
-    MeshFileError,
-    ModelFileError,
-)
+from lcollision_core.errors import FileLockedError, LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.files import atomic_write, file_stamp, locked
 from lcollision_core.files.safe import read_regular
 from lcollision_core.files.table import MODEL_SUFFIX
