@@ -167,9 +167,9 @@ def mirror(
     and its image is not, the image is resolved; exits with 1 if that fails.
     """
     from lcollision_core.bodies import open_body
+    from lcollision_core.tasks.editing import mirror_poses
     from lcollision_core.tasks.exporting import refuse_to_replace, require_output, write_result
     from lcollision_core.tasks.inputs import read_some_poses
-    from lcollision_core.tasks.mirroring import mirror_poses
 
     destination = require_output(output, ".json")
     refuse_to_replace([output], [poses], in_place=in_place)

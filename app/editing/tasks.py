@@ -21,8 +21,7 @@ from app.work.preparing import open_poses_to_show, open_to_show, prepare, ready
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
 from lcollision_core.tasks import changing
-from lcollision_core.tasks.editing import resolve_pose, save_poses
-from lcollision_core.tasks.mirroring import mirror_poses
+from lcollision_core.tasks.editing import mirror_poses, resolve_pose, save_poses
 from lcollision_core.tasks.opening import OpenedModel, ReadPoses, examine, import_mesh
 from lcollision_core.tasks.words import (
     counted,
@@ -37,13 +36,7 @@ if TYPE_CHECKING:
     from app.editing.history import PoseHistory
     from app.editing.library import Library
     from app.editing.live_pose import PoseMotion
-    from lcollision_core.bodies import (
-        Body,
-        MirroredPose,
-        NamedPose,
-        OtherModelError,
-        ProposedRules,
-    )
+    from lcollision_core.bodies import Body, MirroredPose, NamedPose, OtherModelError, ProposedRules
     from lcollision_core.contact import ContactRules
     from lcollision_core.files import Character, FileStamp
     from lcollision_core.files.scene_files import SceneDocument

@@ -23,8 +23,7 @@ from app.work.preparing import open_motions_to_show
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
 from lcollision_core.tasks.editing import free_neighbours, resolve_frames
-from lcollision_core.tasks.motions import own_motions, read_motions
-from lcollision_core.tasks.opening import OpenedModel
+from lcollision_core.tasks.opening import OpenedModel, own_motions, read_motions
 from lcollision_core.tasks.words import counted, ground_text
 
 if TYPE_CHECKING:
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
     from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion, ResolvedMotion
     from lcollision_core.options import MotionOptions
-    from lcollision_core.tasks.motions import OpenedMotions
+    from lcollision_core.tasks.opening import OpenedMotions
 
 
 _RATE_SECONDS = 1.0

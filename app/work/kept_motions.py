@@ -21,8 +21,7 @@ from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.safe import read_regular
 from lcollision_core.json_values import from_json, parse_json, to_json
-from lcollision_core.tasks.motions import own_motions, read_motions
-from lcollision_core.tasks.opening import OpenedModel, ReadPoses
+from lcollision_core.tasks.opening import OpenedModel, ReadPoses, own_motions, read_motions
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, OtherModelError

@@ -17,11 +17,12 @@ from PySide6.QtCore import QObject, Signal
 from app.work import compile_ahead
 from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.tasks.motions import OpenedMotions, open_motions
 from lcollision_core.tasks.opening import (
     OpenedModel,
+    OpenedMotions,
     ReadPoses,
     open_model,
+    open_motions,
     open_poses,
 )
 

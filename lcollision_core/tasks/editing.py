@@ -1,4 +1,4 @@
-"""Resolve and save the edited pose or motion; imported before the window exists."""
+"""Resolve, mirror and save poses and motions; imported before the window exists."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lcollision_core.jobs import Job
 from lcollision_core.options import MotionOptions, ResolveOptions
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import Body, NamedPose
+    from lcollision_core.bodies import Body, MirroredPose, NamedPose
     from lcollision_core.files import FileStamp
     from lcollision_core.meshes import RigidTransform
     from lcollision_core.motion import Motion, ResolvedMotion, Solved
@@ -111,6 +111,24 @@ def free_neighbours(
     for within in runs(is_new):
         eased = resolve_motion(body.resolver, eased, up, options, None, job, within=within).motion
     return None if eased is edited else eased
+
+
+def mirror_poses(
+    body: Body, poses: Sequence[NamedPose], job: Job
+) -> list[tuple[NamedPose, MirroredPose]]:
+    """Return the mirror images of poses, each with its report.
+
+    Raises
+    ------
+    LCollisionError : the body is not symmetric.
+    CancelledError : the job was cancelled.
+    """
+    symmetry, images = body.pose_mirror.symmetry, []
+    for done, pose in enumerate(poses, 1):
+        image = body.mirror(pose.latent, pose.placement, pose.mirror_of, job=job.part())
+        images.append((pose.mirrored(image, symmetry), image))
+        job.report(done, len(poses))
+    return images
 
 
 def save_poses(

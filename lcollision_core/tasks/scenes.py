@@ -14,8 +14,12 @@ from lcollision_core.errors import LCollisionError, PoseSetError
 from lcollision_core.files.table import POSES_SUFFIX, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import ExportRequest, MotionChoice, SceneOptions
-from lcollision_core.tasks.exporting import refuse_to_replace, source_files
-from lcollision_core.tasks.members import write_members, written_members
+from lcollision_core.tasks.exporting import (
+    refuse_to_replace,
+    source_files,
+    write_members,
+    written_members,
+)
 from lcollision_core.tasks.words import say
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.files import write_mesh
 from lcollision_core.options import ExportRequest, ResolveOptions
 from lcollision_core.posing import DragOptions, Grip
-from lcollision_core.tasks.members import write_members
+from lcollision_core.tasks.exporting import write_members
 from tests.rigged_shapes import rigged_body, write_gltf
 from tests.small_models import DATA
 
