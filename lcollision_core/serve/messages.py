@@ -1,9 +1,11 @@
-"""Messages between clients and the engine: see docs/protocol.md."""
+"""Messages between clients and the engine, and their bytes in a stream: see docs/protocol.md."""
 
 from __future__ import annotations
 
 import math
 import re
+import struct
+from io import BufferedReader
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
@@ -16,6 +18,15 @@ from lcollision_core.json_values import convert_checked
 from lcollision_core.options import LARGEST_CHANGE
 
 PROTOCOL_VERSION: Final = 1
+
+MARK: Final = b"LCM1"
+"""Starts each message, so that a reader that has lost its place finds the next one."""
+
+MAX_LENGTH: Final = 1 << 28
+"""Largest length of a message in bytes."""
+
+_LENGTH = struct.Struct("<I")
+_PIECE = 1 << 16
 
 _MOST_NAMES, _SHOWN = 100_000, 60
 
@@ -168,7 +179,6 @@ class SetRules(_CharacterRequest, tag="set_rules"):
 
 
 Clearance = Annotated[float, Meta(ge=0.0, lt=1.0)]
-LargestChange = Annotated[float, Meta(gt=0.0)]
 
 
 class Check(_CharacterRequest, tag="check"):
@@ -205,37 +215,43 @@ class Drag(_CharacterRequest, tag="drag"):
     locked: Names = []
 
 
-Beyond = Annotated[float, Meta(ge=0.0, le=1.0)]
+class _ResolveRequest(_CharacterRequest, kw_only=True):
+    """Options of resolving.
+
+    Attributes
+    ----------
+    locked : joints whose body parts must not turn
+    turning : the only joints that may turn, with the whole body if its root is one; all by default
+    beyond : fraction of the correction to add to it, if that is free
+    clearance : normalised clearance to keep
+    largest_change : normalised, the farthest that a vertex may move
+    least_change : normalised: joints whose turns together move no vertex by more stay, in a motion
+        span by span, if nothing is worse without them
+    """
+
+    locked: Names = []
+    turning: Names | None = None
+    beyond: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    clearance: Clearance = 0.0
+    largest_change: Annotated[float, Meta(gt=0.0)] = LARGEST_CHANGE
+    least_change: Clearance = 0.0
 
 
-class ResolvePose(_CharacterRequest, tag="resolve_pose"):
+class ResolvePose(_ResolveRequest, tag="resolve_pose"):
     """Find the nearest free pose.
 
     Attributes
     ----------
     vertices : (W, 3) vertices as shown; their offsets from the rig's turn along with the joints
-    locked : joints whose body parts must not turn
-    turning : the only joints that may turn, with the whole body if its root is one; all by default
     keep_feet : whether parts that stand on the ground stay there
-    beyond : fraction of the correction to add to it, if that is free
-    clearance : normalised clearance to keep
-    largest_change : normalised, the farthest that a vertex may move
-    least_change : normalised: joints whose turns together move no vertex by more stay, if the pose
-        is no worse without them
     """
 
     transforms: Array
     vertices: Array | None = None
     keep_feet: bool = False
-    locked: Names = []
-    turning: Names | None = None
-    beyond: Beyond = 0.0
-    clearance: Clearance = 0.0
-    largest_change: LargestChange = LARGEST_CHANGE
-    least_change: Clearance = 0.0
 
 
-class ResolveMotion(_CharacterRequest, tag="resolve_motion"):
+class ResolveMotion(_ResolveRequest, tag="resolve_motion"):
     """Resolve the colliding spans of a motion.
 
     Attributes
@@ -246,10 +262,6 @@ class ResolveMotion(_CharacterRequest, tag="resolve_motion"):
     within : the first frame that may change, and the one after the last; all by default
     substeps : number of poses between two frames that must be free too
     continuous : whether the linear paths of the vertices between frames must be free
-    clearance : normalised clearance to keep in all frames
-    largest_change : normalised, the farthest that a vertex may move
-    least_change : normalised: in a span, joints whose turns together move no vertex by more stay,
-        if no frame is worse without them
     """
 
     transforms: Array
@@ -260,12 +272,6 @@ class ResolveMotion(_CharacterRequest, tag="resolve_motion"):
     within: Annotated[list[Count], Meta(min_length=2, max_length=2)] | None = None
     substeps: Annotated[int, Meta(ge=0, le=15)] = 1
     continuous: bool = False
-    locked: Names = []
-    turning: Names | None = None
-    beyond: Beyond = 0.0
-    clearance: Clearance = 0.0
-    largest_change: LargestChange = LARGEST_CHANGE
-    least_change: Clearance = 0.0
 
 
 class ProposeRules(_CharacterRequest, tag="propose_rules"):
@@ -368,3 +374,68 @@ def write_reply(number: int | None, kind: str, **values: Any) -> bytes:
         for key, value in values.items()
     }
     return msgspec.msgpack.encode({"type": kind, "id": number, **fields})
+
+
+class FrameReader:
+    """Reads the messages of a stream.
+
+    Parameters
+    ----------
+    stream : binary stream whose `read` blocks until it has all the bytes asked for, or the end
+    """
+
+    def __init__(self, stream: BufferedReader) -> None:
+        self._stream = stream
+        self._is_lost = False
+
+    def lose_place(self) -> None:
+        """Let the next `read` skip to the next mark without an error."""
+        self._is_lost = True
+
+    def read(self) -> bytes | None:
+        """Return the next message; None at the end of the stream.
+
+        Raises
+        ------
+        LCollisionError : the bytes are no message, or it is too long. The next call skips to the
+            next mark.
+        """
+        head = self._stream.read(len(MARK))
+        if self._is_lost or (head != MARK and len(head) == len(MARK)):
+            was_lost, self._is_lost = self._is_lost, True
+            if not was_lost:
+                raise LCollisionError.must_be("a message", f"begun by {MARK!r}", repr(head))
+            while head != MARK:
+                # Skip all that is buffered at once: there may be hundreds of megabytes.
+                ahead = self._stream.peek()
+                if not ahead:
+                    return None
+                received = head + ahead
+                at = received.find(MARK)
+                end = len(received) if at < 0 else at + len(MARK)
+                self._stream.read(end - len(head))
+                head = received[:end][-len(MARK) :]
+            self._is_lost = False
+        length = self._stream.read(_LENGTH.size)
+        if len(length) < _LENGTH.size:
+            return None
+        (n_bytes,) = _LENGTH.unpack(length)
+        if n_bytes > MAX_LENGTH:
+            self._is_lost = True
+            raise LCollisionError.must_be(
+                "a message", f"at most {MAX_LENGTH} bytes long", f"{n_bytes} bytes"
+            )
+        # Read in pieces: a wrong length must not allocate memory for bytes that never come.
+        pieces, left = [], n_bytes
+        while left:
+            piece = self._stream.read(min(left, _PIECE))
+            if not piece:
+                return None
+            pieces.append(piece)
+            left -= len(piece)
+        return b"".join(pieces)
+
+
+def framed(message: bytes) -> bytes:
+    """Return a message with its mark and length."""
+    return MARK + _LENGTH.pack(len(message)) + message

@@ -17,7 +17,6 @@ from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import Job, at_most_every
 from lcollision_core.serve import messages as m
 from lcollision_core.serve.characters import OpenedCharacter, character_id, open_arrays, open_file
-from lcollision_core.serve.framing import FrameReader, framed
 from lcollision_core.serve.work import (
     Dragging,
     answer_resolve_motion,
@@ -54,7 +53,7 @@ class Session:
     """
 
     def __init__(self, read: BufferedReader, write: BinaryIO) -> None:
-        self._reader, self._write = FrameReader(read), write
+        self._reader, self._write = m.FrameReader(read), write
         self._write_lock, self._jobs_lock = Lock(), Lock()
         self._jobs: dict[int, Job] = {}
         self._characters: dict[str, OpenedCharacter] = {}
@@ -218,7 +217,7 @@ class Session:
         self._send(number, "error", {"message": str(error)})
 
     def _send(self, number: int | None, kind: str, values: Reply) -> None:
-        message = framed(m.write_reply(number, kind, **values))
+        message = m.framed(m.write_reply(number, kind, **values))
         try:
             with self._write_lock:
                 self._write.write(message)

@@ -15,7 +15,7 @@ import pytest
 
 from lcollision_core.errors import LCollisionError
 from lcollision_core.serve.client import Reply, wrapped
-from lcollision_core.serve.framing import MARK, MAX_LENGTH, FrameReader, framed
+from lcollision_core.serve.messages import MARK, MAX_LENGTH, FrameReader, framed
 from tests.core.serve.engines import ROOT, as_arrays
 from tests.rigged_shapes import rigged_body
 
