@@ -89,7 +89,6 @@ def decode(
         files_of,
         output_named,
         refuse_to_replace,
-        require_codes_alone,
         require_request,
         source_files,
         write_result,
@@ -98,7 +97,6 @@ def decode(
     from lcollision_core.tasks.scenes import open_scene
 
     destination = output_named(output, request.form)
-    require_codes_alone(destination, request)
     model = open_scene(model_name, scene).with_options(rules)
     named = read_some_poses(poses, model)
     source = require_request(destination, model, named, request)

@@ -273,7 +273,6 @@ def _resolve_poses(
         files_of,
         refuse_to_replace,
         require_one_mesh,
-        require_request,
         source_files,
     )
     from lcollision_core.tasks.inputs import mesh_files_of, read_input_poses
@@ -300,9 +299,7 @@ def _resolve_poses(
             given, failed = read_input_poses(body, files, scale, job)
     if not given:
         raise typer.Exit(ExitStatus.BAD_INPUT)
-    require_one_mesh(output, len(given))
     poses = [given_pose.pose for given_pose in given]
-    require_request(output, body, poses, export)
     read = [*files, *source_files(body, export)]
     refuse_to_replace(files_of(output, body, poses, export), read, in_place=in_place)
     with cancellable_bar("Resolving poses") as job:

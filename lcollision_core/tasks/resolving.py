@@ -16,24 +16,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
-from lcollision_core.files import file_stamp, locked, unused_name
+from lcollision_core.errors import CancelledError, LCollisionError
+from lcollision_core.files import file_stamp
 from lcollision_core.files.safe import atomic_write
-from lcollision_core.files.table import SCENE_SUFFIXES
-from lcollision_core.jobs import UNWATCHED, Job, available_cores, for_blocks
+from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.options import ExportRequest, MotionChoice, MotionOptions, ResolveOptions
 from lcollision_core.tasks.exporting import (
     Output,
+    as_frames,
+    motion_outputs,
     output_named,
     refuse_to_replace,
+    require_motions,
     require_request,
     source_files,
+    write_motions,
     write_result,
 )
 from lcollision_core.tasks.inputs import PARTIAL, InputPose, body_of_motion, motion_files
 from lcollision_core.tasks.job import Run, depends_on, key_of, run_of_poses, run_of_rows
 from lcollision_core.tasks.verdicts import FailedFile, ResolvedClip
-from lcollision_core.tasks.words import counted, say, say_number
+from lcollision_core.tasks.words import say, say_number
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, NamedPose, WrittenPose
@@ -377,7 +380,7 @@ def resolve_motions(request: ResolveMotionsRequest, job: Job) -> list[ResolvedCl
         files = [own_file(body)]
         for sentence in body.notes:
             job.note(sentence)
-    output = _as_frames(request.output, files)
+    output = as_frames(request.output, files)
     for path in files:
         body = body_of_motion(body, path, job)
     choice = request.choice
@@ -389,7 +392,7 @@ def resolve_motions(request: ResolveMotionsRequest, job: Job) -> list[ResolvedCl
     request = replace(request, body=body, files=files, output=output)
     if request.only_check:
         return [_check_motion(request, motion, job) for motion in motions]
-    _require_output(output, body, files, motions)
+    require_motions(output, body, files, motions)
     changes: list[MotionChange] = []
     rows: list[ResolvedClip] = []
     with run_of_motions(request, motions, job) as run:
@@ -575,168 +578,6 @@ def _inputs_of_motions(
     return arrays, {**values, **settings, **feet, "command": "resolve --motion"}
 
 
-def _as_frames(output: Output, files: Sequence[Path]) -> Output:
-    """Return the output, in the form of frames if the input is not of its skeleton format."""
-    from lcollision_core.files.table import OWN_SUFFIXES, SKELETON_SUFFIXES
-
-    suffix = output.path.suffix.lower()
-    if output.form != "mesh" or suffix not in SKELETON_SUFFIXES:
-        return output
-    is_own = suffix in OWN_SUFFIXES and [path.suffix.lower() for path in files] == [suffix]
-    return output if is_own else replace(output, form="frames")
-
-
-def _require_output(
-    output: Output, body: Body, files: Sequence[Path], motions: Sequence[Motion]
-) -> None:
-    """Raise early if an output cannot hold the motions."""
-    from lcollision_core.bodies.motions import character_of_motion, is_of_skeleton, is_retargeted
-    from lcollision_core.bodies.retargeting import require_skeleton
-    from lcollision_core.files.table import BVH_SUFFIX, OWN_SUFFIXES
-    from lcollision_core.files.written import require_written
-
-    suffix = output.path.suffix.lower()
-    if output.form == "frames":
-        require_skeleton(output.path, body)
-    if suffix in OWN_SUFFIXES and output.form == "mesh":
-        is_own = files[0].suffix.lower() == suffix and is_of_skeleton(files[0])
-        # A retargeted SMPL motion cannot hold the body's joints.
-        is_own = is_own and (suffix == BVH_SUFFIX or not is_retargeted(body, files[0]))
-        if len(files) > 1 or not is_own:
-            raise MeshFileError.unwritable(
-                output.path,
-                "the motion has no skeleton of that format",
-                "name a .pc2 or .mdd file, a folder or a .json file",
-            )
-    elif output.form == "mesh":
-        character = character_of_motion(body, files[0]) if len(files) == 1 else None
-        if character is None and all(is_retargeted(body, file) for file in files):
-            character = body.character
-        if character is None:
-            raise MeshFileError.unwritable(
-                output.path,
-                "clips can be written only to their own character's file",
-                "name a .bvh, .vrma, .pc2 or .mdd file, a folder or a .json file",
-            )
-        require_written(output.path, character)
-    elif output.form == "frames" and len(motions) > 1:
-        names = ", ".join(repr(motion.name) for motion in motions[:8])
-        raise LCollisionError(
-            f"holds one motion, but there are {len(motions)}: {names}",
-            "choose one with --clip, or name a folder",
-            where=output.path,
-        )
-
-
-def write_motions(
-    output: Output,
-    body: Body,
-    file: Path,
-    changes: Sequence[MotionChange],
-    rows: Sequence[ResolvedClip],
-    job: Job,
-) -> None:
-    """Write motions, and update their rows by the check of the output."""
-    from lcollision_core.bodies import NamedPose, unique_names
-    from lcollision_core.files.table import SKELETON_SUFFIXES
-
-    if output.form == "mesh":
-        _write_clips(output, body, file, changes, rows, job)
-        return
-    check = body.exact_check()
-    motions = [change.after for change in changes]
-    names = unique_names(f"{motion.name} {n}" for motion in motions for n in range(len(motion)))
-    frames = [(motion, n) for motion in motions for n in range(len(motion))]
-    poses = [
-        NamedPose(name, motion.codes[n], motion.placement(n))
-        for name, (motion, n) in zip(names, frames, strict=True)
-    ]
-    request = ExportRequest(fps=motions[0].rate)
-    source = require_request(output, body, poses, request)
-    # Lazily: all meshes at once may not fit in memory.
-    meshes = (motion.vertices(n, check) for motion, n in frames)
-    is_skeleton = output.path.suffix.lower() in SKELETON_SUFFIXES
-    posed = write_result(
-        output, body, poses, request, meshes, source, keeps_meshes=is_skeleton, job=job
-    )
-    # Joint rotations alone may not express a frame exactly.
-    if is_skeleton:
-        (row,) = rows
-        collides = np.zeros(len(posed), dtype=np.bool_)
-
-        def look(start: int, stop: int) -> None:
-            collides[start:stop] = [posed[n].collides(body) for n in range(start, stop)]
-
-        for_blocks(look, len(posed), 1, job=job.part())
-        _count_stuck(row, body, collides)
-    elif output.form == "poses" and body.joints is not None:
-        for motion, row in zip(motions, rows, strict=True):
-            if motion.space_at is not None:
-                _count_stuck(row, body, ~check.are_free(motion.codes))
-                left_out = "{path}: pose files store rotations and weights only; other deformation "
-                left_out += "in {clip} is left out (use .glb or .pc2 to keep it)"
-                job.note(say(left_out, path=output.path, clip=motion.name))
-
-
-def _count_stuck(
-    row: ResolvedClip,
-    body: Body,
-    collides: npt.NDArray[np.bool_],
-    put_back: Sequence[range] = (),
-) -> None:
-    """Add frames that collide in the output to a row, with the reason.
-
-    Parameters
-    ----------
-    collides : (T,) verdicts of the output
-    put_back : frames that were written unchanged
-    """
-    from lcollision_core.motion import KeptSpan, Reason
-    from lcollision_core.motion.motion import runs
-
-    row.colliding_frames = sorted({*row.colliding_frames, *np.flatnonzero(collides).tolist()})
-    row.free_after = row.frames - len(row.colliding_frames)
-    named = np.zeros(row.frames, dtype=np.bool_)
-    for first, last in (span["frames"] for span in row.kept_spans):
-        named[first : last + 1] = True
-    of_form = [(span, True) for span in put_back]
-    of_form += [(run, False) for run in runs(collides & ~named)]
-    for span, is_original in of_form:
-        ends = span.start, span.stop - 1
-        kept_span = KeptSpan(ends, Reason.AS_WRITTEN, is_original=is_original)
-        row.kept_spans.append(kept_span.to_json(body.domain_names))
-
-
-def _write_clips(
-    output: Output,
-    body: Body,
-    file: Path,
-    changes: Sequence[MotionChange],
-    rows: Sequence[ResolvedClip],
-    job: Job,
-) -> None:
-    """Write the character's file with changed clips, or with retargeted motions as new ones."""
-    from lcollision_core.bodies.motions import is_retargeted, write_clips, write_new_clips
-
-    with locked(output.path):
-        path = output.path
-        if file_stamp(path) != output.before:
-            path = unused_name(path)
-        if path.suffix.lower() in SCENE_SUFFIXES and is_retargeted(body, file):
-            written = write_new_clips(path, body, [change.after for change in changes])
-        else:
-            written = write_clips(path, body, file, changes)
-    for sentence in written.notes:
-        job.note(sentence)
-    job.note(say("wrote {clips} to {path}", clips=counted(len(changes), "clip"), path=path))
-    for row, of_file, put_back in zip(rows, written.free, written.put_back, strict=True):
-        row.output = str(path)
-        # Rounding reduces the clearance slightly; without one, the check of the file decides.
-        if row.clearance == 0.0:
-            row.colliding_frames = []
-        _count_stuck(row, body, ~of_file, put_back)
-
-
 # Folders of motions.
 
 
@@ -909,44 +750,6 @@ def _resolve_file(
         raise
     except LCollisionError as error:
         return [FailedFile(path.name, str(error))]
-
-
-def motion_outputs(
-    body: Body, files: Iterable[Path], folder: Path, root: Path | None = None
-) -> dict[Path, Path]:
-    """Return the output of each file's motions: its own kind of file, else a point cache.
-
-    Parameters
-    ----------
-    files : of motions
-    folder : of the results
-    root : input folder; its subfolders are kept
-    """
-    from lcollision_core.bodies import unique_names
-    from lcollision_core.bodies.motions import is_of_skeleton, is_retargeted
-    from lcollision_core.files.table import BVH_SUFFIX, OWN_SUFFIXES
-
-    by_folder: dict[Path, list[tuple[Path, str]]] = {}
-    for path in files:
-        suffix = path.suffix.lower()
-        if suffix in SCENE_SUFFIXES and body.joints is not None:
-            own_suffix = "" if body.own_file is None else body.own_file.suffix.lower()
-            suffix = suffix if suffix == own_suffix == ".vrm" else ".glb"
-        elif suffix not in (".json", ".mdd") and not (
-            suffix in OWN_SUFFIXES
-            and is_of_skeleton(path)
-            and (suffix == BVH_SUFFIX or not is_retargeted(body, path))
-        ):
-            suffix = ".pc2"
-        inside = folder if root is None else folder / path.parent.relative_to(root)
-        by_folder.setdefault(inside, []).append((path, suffix))
-    return {
-        path: inside / f"{stem}{suffix}"
-        for inside, named in by_folder.items()
-        for (path, suffix), stem in zip(
-            named, unique_names(path.stem for path, _ in named), strict=True
-        )
-    }
 
 
 def _name(path: Path, root: Path | None) -> str:

@@ -18,6 +18,7 @@ from lcollision_core.tasks.exporting import (
     refuse_to_replace,
     source_files,
     write_members,
+    write_motions,
     written_members,
 )
 from lcollision_core.tasks.words import say
@@ -561,7 +562,7 @@ def resolve_scene_motion(
         `in_place` is not set.
     CancelledError : the job was cancelled; finished frames are kept beside the output.
     """
-    from lcollision_core.tasks.resolving import resolve_one, run_of_motions, write_motions
+    from lcollision_core.tasks.resolving import resolve_one, run_of_motions
 
     motion, of_bodies = scene_motion(body, played, request.choice, job)
     output = request.output
