@@ -32,7 +32,6 @@ from lcollision_core.tasks.words import say, say_number
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, MeshBody, RigBody
-    from lcollision_core.contact import NearestPair, SelfCollisions
     from lcollision_core.files import Mesh
     from lcollision_core.meshes import ContactRules, FaceGroup, Topology
     from lcollision_core.motion import Motion, ScreenedMotion
@@ -89,7 +88,7 @@ class CheckRequest:
 
 
 def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> CheckedMesh:
-    """Check one mesh, by the contact rules of its character if known.
+    """Check one mesh, by the contact rules of its character if known, or those of a scene.
 
     Raises
     ------
@@ -107,37 +106,22 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
         raise MeshFileError(what, "name a rest pose of this mesh", where=path)
     for remark in (*mesh.notes, *audit_mesh(mesh.topology, mesh.vertices)):
         job.note(f"{path}: {remark}")
-    known_body = None if request.no_rules or rest is not None else _known(path, mesh, job)
+    character = None if request.no_rules or rest is not None else _character(path, mesh, job)
     body: Body
     try:
-        if known_body is not None:
-            body, vertices = known_body[0], known_body[1]
+        if character is not None:
+            body, vertices = character
         else:
             vertices, groups = mesh.vertices, _groups(path, mesh.topology, request)
             reference = vertices if rest is None else rest.vertices
             body = MeshBody(vertices[None], mesh.topology, reference, groups=groups)
-        detector = _as_asked(body, request).detector
-        rules, topology = detector.rules, detector.topology
-        rest_is_known = known_body is not None or rest is not None
-        detector = detector.with_clearance(request.clearance, rest_is_known=rest_is_known)
-        nearest = None
-        if request.clearance > 0.0:
-            bound = max(DISTANCE_BOUND, request.clearance)
-            nearest = detector.least_distance(vertices, bound, rest_is_known=rest_is_known)
-        collisions = detector.summarise(vertices, n_deepest=_DEEPEST, job=job)
+        is_known = character is not None or rest is not None
+        checked, _ = _checked(
+            str(path), _as_asked(body, request), vertices, request, start, job, is_known
+        )
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
-    if collisions.n_coincident_pairs:
-        job.note(
-            say_number(
-                collisions.n_coincident_pairs,
-                "{file}: {n} pair of faces coincides; touching is not a collision",
-                "{file}: {n} pairs of faces coincide; touching is not a collision",
-                file=path,
-            )
-        )
-    checked = _checked(str(path), topology, rules, collisions, nearest, request, start)
-    return replace(checked, rules_of=None if known_body is None else known_body[0].name)
+    return checked if character is None else replace(checked, rules_of=body.name)
 
 
 def _check_scene(path: Path, request: CheckRequest, job: Job) -> CheckedMesh:
@@ -151,55 +135,59 @@ def _check_scene(path: Path, request: CheckRequest, job: Job) -> CheckedMesh:
     for part in scene.bodies:
         file = Path(part.file)
         mesh = read_mesh(file)
-        known_body: tuple[Body, npt.NDArray[np.float64]] | None = None
+        body: Body | None = None
+        vertices = mesh.vertices
         if not request.no_rules:
-            known_body = _known(file, mesh, job)
-        if (
-            known_body is None
-            and not request.no_rules
-            and (rigged := open_rigged(file)) is not None
-        ):
-            character = open_body(rigged)
-            known_body = (character, character.reference) if character.joints is not None else None
-        vertices = mesh.vertices if known_body is None else known_body[1]
-        body = (
-            MeshBody(vertices[None], mesh.topology, vertices)
-            if known_body is None
-            else known_body[0]
-        )
-        bodies.append(body)
+            if (character := _character(file, mesh, job)) is not None:
+                body, vertices = character
+            elif (document := open_rigged(file)) is not None:
+                rigged = open_body(document)
+                if rigged.joints is not None:
+                    body, vertices = rigged, rigged.reference
+        bodies.append(body or MeshBody(vertices[None], mesh.topology, vertices))
         posed.append(vertices)
     scene_body = _as_asked(body_of_scene(scene, bodies, as_posed=True), request)
-    names = [member.name for member in scene_body.members]
-    in_order = sorted(range(len(names)), key=lambda n: scene_body.vertices_of[names[n]].start)
-    shown_meshes = [*posed, *(member.body.reference for member in scene_body.members[len(posed) :])]
-    vertices = np.concatenate(
-        [scene_body.members[n].place.apply(shown_meshes[n]) for n in in_order]
+    members = scene_body.members
+    in_order = sorted(
+        range(len(members)), key=lambda n: scene_body.vertices_of[members[n].name].start
     )
-    detector = scene_body.detector.with_clearance(request.clearance)
-    nearest = None
-    if request.clearance > 0.0:
-        bound = max(DISTANCE_BOUND, request.clearance)
-        nearest = detector.least_distance(vertices, bound)
-    collisions = detector.summarise(vertices, n_deepest=_DEEPEST, job=job)
+    shown_meshes = [*posed, *(member.body.reference for member in members[len(posed) :])]
+    vertices = np.concatenate([members[n].place.apply(shown_meshes[n]) for n in in_order])
     files = " + ".join(part.file for part in scene.bodies)
-    checked = _checked(
-        files, scene_body.topology, detector.rules, collisions, nearest, request, start
-    )
-    return replace(checked, parts=parts_text(scene_body, collisions.pairs))
+    checked, pairs = _checked(files, scene_body, vertices, request, start, job)
+    return replace(checked, parts=parts_text(scene_body, pairs))
 
 
 def _checked(
     file: str,
-    topology: Topology,
-    rules: ContactRules,
-    collisions: SelfCollisions,
-    nearest: NearestPair | None,
+    body: Body,
+    vertices: npt.NDArray[np.float64],
     request: CheckRequest,
     start: float,
-) -> CheckedMesh:
-    """Return the verdict of a mesh, with the time since `start`."""
+    job: Job,
+    rest_is_known: bool = True,
+) -> tuple[CheckedMesh, npt.NDArray[np.integer]]:
+    """Check a mesh of a body; return the verdict, with the time since `start`, and the pairs."""
+    detector = body.detector.with_clearance(request.clearance, rest_is_known=rest_is_known)
+    nearest = None
+    if request.clearance > 0.0:
+        bound = max(DISTANCE_BOUND, request.clearance)
+        nearest = detector.least_distance(vertices, bound, rest_is_known=rest_is_known)
+    collisions = detector.summarise(vertices, n_deepest=_DEEPEST, job=job)
+    if collisions.n_coincident_pairs:
+        job.note(
+            say_number(
+                collisions.n_coincident_pairs,
+                "{file}: {n} pair of faces coincides; touching is not a collision",
+                "{file}: {n} pairs of faces coincide; touching is not a collision",
+                file=file,
+            )
+        )
+    topology, rules = body.detector.topology, body.detector.rules
     deepest = zip(collisions.pairs.tolist(), collisions.penetration_depth.tolist(), strict=True)
+    least_at = None
+    if nearest is not None:
+        least_at = {"faces": nearest.faces.tolist(), "points": nearest.points.tolist()}
     return CheckedMesh(
         file=file,
         vertices=topology.n_vertices,
@@ -214,14 +202,12 @@ def _checked(
         deepest=[{"faces": faces, "depth": depth} for faces, depth in deepest],
         clearance=request.clearance,
         least_distance=None if nearest is None else nearest.distance,
-        least_at=None
-        if nearest is None
-        else {"faces": nearest.faces.tolist(), "points": nearest.points.tolist()},
+        least_at=least_at,
         energy=collisions.energy,
         colliding=collisions.colliding,
         seconds=time.perf_counter() - start,
         not_counted=rules.sentence(collisions.excluded),
-    )
+    ), collisions.pairs
 
 
 def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list[CheckedClip]:
@@ -374,23 +360,20 @@ def _verdict(
     rules: ContactRules,
     request: CheckRequest,
 ) -> CheckedClip:
-    colliding = {
-        frame_collisions.frame: frame_collisions for frame_collisions in screened.colliding
-    }
-    excluding = {left_out.frame: left_out for left_out in screened.excluded}
+    colliding = {collisions.frame: collisions for collisions in screened.colliding}
+    excluding = {exclusions.frame: exclusions for exclusions in screened.excluded}
 
     def row(frame: int) -> CheckedFrame:
-        counted, left_out = colliding.get(frame), excluding.get(frame)
-        parts = () if counted is None else counted.domains
+        counted, excluded = colliding.get(frame), excluding.get(frame)
         return CheckedFrame(
-            frame=frame,
-            seconds=float(times[frame]),
-            pairs=0 if counted is None else counted.n_pairs,
-            deepest=0.0 if counted is None else counted.deepest,
-            parts=[[str(names[a]), str(names[b])] for a, b in parts],
-            excluded_pairs=None if left_out is None else left_out.counts.total,
-            excluded_deepest=None if left_out is None else left_out.deepest,
-            excluded_rules=None if left_out is None else left_out.counts.to_json(),
+            frame,
+            float(times[frame]),
+            0 if counted is None else counted.n_pairs,
+            0.0 if counted is None else counted.deepest,
+            [[str(names[a]), str(names[b])] for a, b in (counted.domains if counted else ())],
+            None if excluded is None else excluded.counts.total,
+            None if excluded is None else excluded.deepest,
+            None if excluded is None else excluded.counts.to_json(),
         )
 
     return CheckedClip(
@@ -401,8 +384,8 @@ def _verdict(
         colliding_frames=[row(frame) for frame in colliding],
         excluding_frames=[
             row(frame)
-            for frame, left_out in excluding.items()
-            if left_out.counts.total and frame not in colliding
+            for frame, excluded in excluding.items()
+            if excluded.counts.total and frame not in colliding
         ],
         in_between=list(screened.in_between),
         collides_between=screened.collides_between,
@@ -436,20 +419,15 @@ def table_of(verdicts: Iterable[CheckedClip]) -> str:
     return table.getvalue()
 
 
-def with_rest(options: RuleOptions) -> RuleOptions:
-    """Return options for a mesh with a rest pose: contacts at rest are excluded by default."""
-    if options.rest_exclusion is not None:
-        return options
-    return replace(options, rest_exclusion=CHARACTER_REST_EXCLUSION)
-
-
 _AnyBody = TypeVar("_AnyBody", bound="Body")
 
 
 def _as_asked(body: _AnyBody, request: CheckRequest) -> _AnyBody:
-    """Return a body with the contact rules of a request."""
+    """Return a body with the contact rules of a request; a rest pose excludes its contacts."""
     body = body.with_rules(STRICT) if request.no_rules else body
-    options = request.rules if request.rest is None else with_rest(request.rules)
+    options = request.rules
+    if request.rest is not None and options.rest_exclusion is None:
+        options = replace(options, rest_exclusion=CHARACTER_REST_EXCLUSION)
     return body.with_options(options).with_touching(request.touch)
 
 
@@ -464,7 +442,7 @@ def _groups(path: Path, topology: Topology, request: CheckRequest) -> tuple[Face
     return joined.groups if joined.topology == topology else ()
 
 
-def _known(path: Path, mesh: Mesh, job: Job) -> tuple[RigBody, npt.NDArray[np.float64]] | None:
+def _character(path: Path, mesh: Mesh, job: Job) -> tuple[RigBody, npt.NDArray[np.float64]] | None:
     """Return the character of a mesh file, with its rules, and the pose; None if there is none."""
     from lcollision_core.bodies import character_of_mesh
 
