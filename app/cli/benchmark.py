@@ -25,10 +25,14 @@ from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
     from app.benchmarks.timing import Row
+    from lcollision_core.bodies import Body
 
 app = typer.Typer(help="Measure what docs/results.md quotes.", no_args_is_help=True)
 
 ModelOption = Annotated[str, typer.Option("--model", metavar="M", help="A model with a predictor.")]
+BodyOption = Annotated[
+    str, typer.Option("--model", metavar="M|FILE", help="A model, or a rigged character.")
+]
 
 _MISSING = "is not installed, so it is skipped; pip install 'lcollision[bench]' installs it"
 _PREDICTOR_IN_PAPER = (
@@ -74,10 +78,9 @@ def detection(
         rows += timings
         # The first row of each set is ours on one thread.
         ratios += [row["ms_per_pose"] / timings[0]["ms_per_pose"] for row in timings]
-    if as_json:
-        print_json(rows)
-        return
-    print_table([row | {"x ours": ratio} for row, ratio in zip(rows, ratios, strict=True)])
+    if not as_json:
+        rows = [row | {"x ours": ratio} for row, ratio in zip(rows, ratios, strict=True)]
+    _print_rows(rows, as_json)
 
 
 @app.command("predictor")
@@ -192,21 +195,14 @@ def resolve(
         for run in runs:
             draw_histograms(run, figure)
         note(f"saved {2 * len(runs)} histograms to {figure}")
-    if as_json:
-        print_json([row | {"near_exclusion": model.rules.near_exclusion} for row in rows])
-        return
-    print_table(rows)
-    note_rules(model)
-    if runs:
+    _print_rows(rows, as_json, model)
+    if runs and not as_json:
         note(_RESOLVE_IN_PAPER)
 
 
 @app.command("drag")
 def drag(
-    model_name: Annotated[
-        str,
-        typer.Option("--model", metavar="M", help="A model or a character; no predictor needed."),
-    ] = "body",
+    model_name: BodyOption = "body",
     n_targets: Annotated[
         int, typer.Option("-n", min=1, max=10_000, metavar="N", help="Targets of each grip.")
     ] = 40,
@@ -219,23 +215,12 @@ def drag(
     model = open_body(model_name)
     with cancellable_bar("Dragging") as job:
         rows = time_drags(model, n_targets, job=job)
-    if as_json:
-        print_json(
-            [
-                {"model": model.name, "near_exclusion": model.rules.near_exclusion} | row
-                for row in rows
-            ]
-        )
-        return
-    print_table(rows)
-    note_rules(model)
+    _print_rows(rows, as_json, model)
 
 
 @app.command("cores")
 def cores(
-    model_name: Annotated[
-        str, typer.Option("--model", metavar="M|FILE", help="A model, or a rigged character.")
-    ] = "body",
+    model_name: BodyOption = "body",
     data: Annotated[
         Path | None,
         typer.Option(metavar="FILE", readable=False, help="The motion that is screened."),
@@ -257,9 +242,7 @@ def cores(
 
 @app.command("gpu")
 def gpu(
-    model_name: Annotated[
-        str, typer.Option("--model", metavar="M|FILE", help="A model, or a rigged character.")
-    ] = "body",
+    model_name: BodyOption = "body",
     data: Annotated[
         Path | None,
         typer.Option(
@@ -289,9 +272,7 @@ def gpu(
 
 @app.command("motion")
 def motion(
-    model_name: Annotated[
-        str, typer.Option("--model", metavar="M|FILE", help="A model, or a rigged character.")
-    ] = "body",
+    model_name: BodyOption = "body",
     data: Annotated[
         Path | None,
         typer.Option(
@@ -312,11 +293,7 @@ def motion(
     with cancellable_bar("Resolving frames") as job:
         for measured in motions_of(model, data):
             rows += score_motion(model, measured, workers, job)
-    if as_json:
-        print_json([{"model": model.name, **row} for row in rows])
-        return
-    print_table(rows)
-    note_rules(model)
+    _print_rows(rows, as_json, model)
 
 
 @app.command("contacts")
@@ -409,8 +386,12 @@ def _require_folder(folder: Path) -> None:
     require_writable(folder / "convergence.png")
 
 
-def _print_rows(rows: list[Row], as_json: bool) -> None:
+def _print_rows(rows: list[Row], as_json: bool, body: Body | None = None) -> None:
+    """Print measurements, and the body that they are of, with its contact rules."""
     if as_json:
-        print_json(rows)
-    else:
-        print_table(rows)
+        model = {"model": body.name, "near_exclusion": body.rules.near_exclusion} if body else {}
+        print_json([model | row for row in rows])
+        return
+    print_table(rows)
+    if body is not None:
+        note_rules(body)
