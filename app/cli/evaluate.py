@@ -16,7 +16,7 @@ from app.cli.inputs import DeviceOption, ModelArgument, RowsOption
 from app.cli.models import measured_model, measured_model_sentence
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError
-from lcollision_core.tasks.words import counted
+from lcollision_core.tasks.words import counted, scores_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,12 +24,7 @@ if TYPE_CHECKING:
 
     from lcollision_core.bodies import LearnedBody
     from lcollision_core.labels import LabelRows, LabelStore
-    from lcollision_core.predictor import (
-        CollisionPredictor,
-        KindScores,
-        PredictorMetrics,
-        ScoredRows,
-    )
+    from lcollision_core.predictor import CollisionPredictor, KindScores, ScoredRows
 
 StoreArgument = Annotated[
     Path, typer.Argument(metavar="STORE", help="Samples of the model, from `lcollision label`.")
@@ -134,7 +129,8 @@ def evaluate(
         print_json(measured_model(model) | measured | asdict(metrics) | by_kind | report)
         return
     called = "" if threshold == 0.5 else f", decision threshold {threshold:g}"
-    tell(f"{model.name}, preset {trained.config.preset}{called}: {scores_sentence(metrics)}")
+    scores = scores_text(asdict(metrics), metrics.samples)
+    tell(f"{model.name}, preset {trained.config.preset}{called}: {scores}")
     tell(
         f"  {measured_model_sentence(model)}; {_percent(rows.colliding.mean())} of these "
         f"{counted(len(rows), 'sample')} collide"
@@ -299,16 +295,6 @@ def open_store(path: Path, model: LearnedBody) -> LabelStore:
     labeller = model.labeller(store.identity.draws)
     store.require(StoreIdentity.of(labeller, store.identity.seed))
     return store
-
-
-def scores_sentence(metrics: PredictorMetrics) -> str:
-    """Describe the scores of the classification."""
-    return (
-        f"accuracy {_percent(metrics.accuracy)} on {metrics.samples} unseen samples (majority "
-        f"baseline: {_percent(metrics.majority_rate)}), false positive rate "
-        f"{_percent(metrics.false_positive_rate)}, false negative rate "
-        f"{_percent(metrics.false_negative_rate)}"
-    )
 
 
 def _unseen(

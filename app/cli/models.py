@@ -12,7 +12,7 @@ from app.cli.console import ExitStatus, JsonOption, note, print_json, tell
 from app.cli.contacts import rules_json, rules_sentence
 from app.cli.inputs import Axis, ModelArgument
 from lcollision_core.errors import LCollisionError
-from lcollision_core.tasks.words import counted, duration_text, error_rates
+from lcollision_core.tasks.words import counted, duration_text, scores_text
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, LearnedBody
@@ -315,12 +315,8 @@ def _predictor_sentence(report: dict[str, Any]) -> str:
     metrics = predictor["metrics"]
     if metrics is None:
         return f"predictor {predictor['preset']}, not measured"
-    return (
-        f"predictor {predictor['preset']}: accuracy {100.0 * metrics['accuracy']:.1f} % on unseen "
-        f"samples (majority baseline: {100.0 * metrics['majority_rate']:.1f} %; "
-        f"{error_rates(metrics['false_positive_rate'], metrics['false_negative_rate'])}), of "
-        f"{predictor['rows']} labelled"
-    )
+    scores, n_rows = scores_text(metrics), predictor["rows"]
+    return f"predictor {predictor['preset']}, of {n_rows} labelled samples: {scores}"
 
 
 def _size_sentence(report: dict[str, Any]) -> str:

@@ -16,7 +16,7 @@ from app.cli.options import takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.options import LearningRequest
-from lcollision_core.tasks.words import duration_text, error_rates, spent_text
+from lcollision_core.tasks.words import duration_text, scores_text, spent_text
 
 if TYPE_CHECKING:
     from app.cli.console import BarContent
@@ -108,11 +108,7 @@ def _print(card: LearnedCard) -> None:
         f"  reconstruction error {100.0 * card.error_mean:.2f} % of the body size, at most "
         f"{100.0 * card.error_max:.2f} %"
     )
-    tell(
-        f"  {100.0 * card.accuracy:.1f} % of unseen samples are classified correctly (majority "
-        f"baseline: {100.0 * card.majority_rate:.1f} %): "
-        f"{error_rates(card.false_positive_rate, card.false_negative_rate)}"
-    )
+    tell(f"  {scores_text(asdict(card))}")
     for line in kind_lines(card.kinds):
         tell(f"    {line}")
     tell(

@@ -5,21 +5,21 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from app.cli.console import cancel_on_interrupt, note, progress_bar, status_bar
-from app.cli.evaluate import StoreArgument, kind_lines, open_store, scores_sentence
+from app.cli.evaluate import StoreArgument, kind_lines, open_store
 from app.cli.inputs import Axis, ModelArgument, PoseSetArgument, RowsOption, up_sentence
 from app.cli.models import describe, error_sentence, measured_model_sentence, note_if_beside
 from app.cli.options import takes_options
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import Job
 from lcollision_core.options import RuleOptions
-from lcollision_core.tasks.words import error_rates
+from lcollision_core.tasks.words import error_rates_text, scores_text
 
 if TYPE_CHECKING:
     from app.cli.console import BarContent
@@ -210,7 +210,8 @@ def predictor(
         note_if_beside(written, destination)
         checkpoint.unlink(missing_ok=True)
         if trained.metrics is not None:
-            note(f"wrote {written}: {scores_sentence(trained.metrics)}")
+            scores = scores_text(asdict(trained.metrics), trained.metrics.samples)
+            note(f"wrote {written}: {scores}")
             share = 100.0 * trained.facts.colliding_share
             note(f"{measured_model_sentence(model)}; {share:.1f} % of random poses collide")
             for line in kind_lines(trained.kinds):
@@ -252,6 +253,6 @@ def bar_content_of_predictor(status: PredictorStatus) -> BarContent:
         return status.preparing, 1.0, "labelling patches", []
     facts = [] if status.loss is None else [f"loss {status.loss:.3f}"]
     if any(rate is not None for rate in status.held_out_errors):
-        facts.append(error_rates(*status.held_out_errors))
+        facts.append(error_rates_text(*status.held_out_errors))
     epoch = f"epoch {min(status.epoch + 1, status.epochs)} of {status.epochs}"
     return status.done, status.total, epoch, facts

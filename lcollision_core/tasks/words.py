@@ -10,7 +10,7 @@ from __future__ import annotations
 import gettext
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -167,7 +167,19 @@ def mirrored_text(mirrored: MirroredPose) -> str:
     return say("mirrored with a {error}, {state}", error=error, state=state)
 
 
-def error_rates(false_positive: float | None, false_negative: float | None) -> str:
+def scores_text(scores: Mapping[str, Any], n_samples: int | None = None) -> str:
+    """Describe a predictor's scores, named as in `PredictorMetrics`, on samples unseen by it."""
+    return say(
+        "accuracy {accuracy:.1f} % on {n}unseen samples (majority baseline: {majority:.1f} %), "
+        "{rates}",
+        accuracy=100.0 * scores["accuracy"],
+        n="" if n_samples is None else f"{n_samples} ",
+        majority=100.0 * scores["majority_rate"],
+        rates=error_rates_text(scores["false_positive_rate"], scores["false_negative_rate"]),
+    )
+
+
+def error_rates_text(false_positive: float | None, false_negative: float | None) -> str:
     """Describe a predictor's error rates; None if there were no poses to judge."""
     sides = (
         (false_positive, "free poses called colliding"),
