@@ -46,7 +46,6 @@ from lcollision_core.options import (
 )
 from lcollision_core.tasks.verdicts import FailedFile
 from lcollision_core.tasks.words import (
-    counted,
     duration_text,
     resolved_clip_text,
     resolved_pose_text,
@@ -343,7 +342,9 @@ def _resolve_motions(
     from lcollision_core.tasks.scenes import resolve_scene_motion
 
     scene = as_scene(request.body)
-    request, each = (request, False) if scene is not None else _with_motions_of_folder(request)
+    if scene is None:
+        request = request.with_files_of_folder(Job(note=note))
+    each = scene is None and request.has_output_each
     if request.only_check and not each:
         raise LCollisionError(
             "--only-check needs a folder of motions", "name one, or use check --clips"
@@ -351,7 +352,7 @@ def _resolve_motions(
     if request.remote is not None and not each:
         raise LCollisionError("--scheduler needs a folder of motions", "name one")
     if scene is None and not request.only_check:
-        request.refuse_to_replace(each=each, in_place=in_place)
+        request.refuse_to_replace(in_place=in_place)
 
     def tell_rows(rows: Sequence[Row]) -> None:
         for row in rows:
@@ -383,28 +384,6 @@ def _resolve_motions(
         raise typer.Exit(ExitStatus.BAD_INPUT)
     if not all(isinstance(row, FailedFile) or row.is_free for row in rows):
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
-
-
-def _with_motions_of_folder(request: ResolveMotionsRequest) -> tuple[ResolveMotionsRequest, bool]:
-    """Find the motion files of a folder; several files count as a folder too.
-
-    Returns
-    -------
-    request : with the files, and the folder where one is named
-    each : whether each file comes to one of its own
-    """
-    from lcollision_core.tasks.inputs import motion_files
-
-    inputs, output = request.files, request.output
-    if len(inputs) != 1 or not inputs[0].is_dir():
-        return request, len(inputs) > 1 and output.form == "folder"
-    files = motion_files(inputs[0], Job(note=note), besides=output.path)
-    if not files:
-        return request, False
-    if output.form != "folder":
-        what = f"cannot contain {counted(len(files), 'motion')}"
-        raise LCollisionError(what, "name a folder", where=output.path)
-    return replace(request, files=files, root=inputs[0]), True
 
 
 def _domain(model: Body, name: str) -> int:

@@ -36,7 +36,7 @@ from lcollision_core.tasks.exporting import (
 from lcollision_core.tasks.inputs import PARTIAL, InputPose, body_of_motion, motion_files
 from lcollision_core.tasks.job import Run, depends_on, key_of, run_of_poses, run_of_rows
 from lcollision_core.tasks.verdicts import FailedFile, ResolvedClip
-from lcollision_core.tasks.words import say, say_number
+from lcollision_core.tasks.words import counted, say, say_number
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, NamedPose, WrittenPose
@@ -311,29 +311,46 @@ class ResolveMotionsRequest:
             one of its files.
         """
         root, target = Path(folder), output_named(f"{os.fspath(output)}{os.sep}", of_motions=True)
-        files = motion_files(root, job, besides=target.path)
-        if not files:
-            raise LCollisionError("contains no motion", "name a folder of motions", where=root)
         options = options or MotionOptions()
         choice = MotionChoice(substeps=options.substeps, continuous=options.continuous)
-        request = cls(body, files, target, options, choice, root=root)
-        request.refuse_to_replace(each=True)
+        request = cls(body, [root], target, options, choice).with_files_of_folder(job)
+        if request.root is None:
+            raise LCollisionError("contains no motion", "name a folder of motions", where=root)
+        request.refuse_to_replace()
         return request
 
-    def refuse_to_replace(self, *, each: bool, in_place: bool = False) -> None:
-        """Raise if an output would replace an input.
+    @property
+    def has_output_each(self) -> bool:
+        """Whether each file has its own output."""
+        return self.root is not None or (len(self.files) > 1 and self.output.form == "folder")
 
-        Parameters
-        ----------
-        each : whether each file has its own output
-        in_place : whether the user allows it
+    def with_files_of_folder(self, job: Job) -> ResolveMotionsRequest:
+        """Return the request with a folder replaced by its motion files, if it has any.
+
+        Raises
+        ------
+        LCollisionError : the output cannot contain them.
+        """
+        if len(self.files) != 1 or not self.files[0].is_dir():
+            return self
+        (root,) = self.files
+        files = motion_files(root, job, besides=self.output.path)
+        if not files:
+            return self
+        if self.output.form != "folder":
+            what = f"cannot contain {counted(len(files), 'motion')}"
+            raise LCollisionError(what, "name a folder", where=self.output.path)
+        return replace(self, files=files, root=root)
+
+    def refuse_to_replace(self, *, in_place: bool = False) -> None:
+        """Raise if an output would replace an input, unless the user allows it.
 
         Raises
         ------
         LCollisionError : names the first such file.
         """
         path, outputs = self.output.path, [self.output.path]
-        if each:
+        if self.has_output_each:
             outputs = list(motion_outputs(self.body, self.files, path, self.root).values())
         elif self.output.form == "folder":
             outputs = [path / file.name for file in self.files]
