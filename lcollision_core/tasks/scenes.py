@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -138,6 +138,16 @@ def scene_of_files(files: Sequence[Path]) -> SceneFile:
     return scene
 
 
+def _scene_around(body: Body, body_file: str) -> SceneFile:
+    """Return the scene that a body is, or one of that body alone."""
+    from lcollision_core.bodies import as_scene
+    from lcollision_core.bodies.scene_body import SceneFile, ScenePart
+
+    scene = as_scene(body)
+    scene_file = None if scene is None else scene.file
+    return scene_file or SceneFile((ScenePart(str(Path(body_file).absolute())),))
+
+
 def with_body(body: Body, body_file: str, path: Path) -> SceneFile:
     """Return a body or a scene with another body beside it.
 
@@ -145,15 +155,9 @@ def with_body(body: Body, body_file: str, path: Path) -> SceneFile:
     ------
     LCollisionError : the file cannot be read.
     """
-    from lcollision_core.bodies import as_scene
-    from lcollision_core.bodies.scene_body import SceneFile, ScenePart
     from lcollision_core.bodies.scene_file import beside
 
-    scene = as_scene(body)
-    scene_file = None if scene is None else scene.file
-    return beside(
-        scene_file or SceneFile((ScenePart(str(Path(body_file).absolute())),)), path.absolute()
-    )
+    return beside(_scene_around(body, body_file), path.absolute())
 
 
 def with_ground(body: Body, body_file: str) -> str:
@@ -165,18 +169,10 @@ def with_ground(body: Body, body_file: str) -> str:
     ------
     LCollisionError : the scene file cannot be written.
     """
-    from lcollision_core.bodies import as_scene
-    from lcollision_core.bodies.scene_body import SceneFile, ScenePart
-
-    scene = as_scene(body)
-    scene_file = None if scene is None else scene.file
-    if scene_file is None:
-        scene_file = SceneFile((ScenePart(str(Path(body_file).absolute())),))
-    elif scene_file.ground is not None and len(scene_file.bodies) == 1:
-        return scene_file.bodies[0].file
-    return str(
-        kept_scene(replace(scene_file, ground="rest" if scene_file.ground is None else None))
-    )
+    scene = _scene_around(body, body_file)
+    if scene.ground is not None and len(scene.bodies) == 1:
+        return scene.bodies[0].file
+    return str(kept_scene(replace(scene, ground="rest" if scene.ground is None else None)))
 
 
 def kept_scene(scene: SceneFile) -> Path:
@@ -350,61 +346,56 @@ def scene_motion(
         file, clip, seconds = asked_clips[member.name]
         motion = read_motions(member.body, file, clip, rate, job.part())[0].at_rate(rate)
         motions.append(PlayedMotion(member, motion, file, round(seconds * rate)))
-    n = max(played.start + len(played.motion) for played in motions if played.motion is not None)
+    moving = [(played, played.motion) for played in motions if played.motion is not None]
+    n = max(played.start + len(motion) for played, motion in moving)
+    codes_of = {played.member.name: motion.codes[played.frames(n)] for played, motion in moving}
     codes = np.array(
         [
-            body.joined_codes([_codes_of(motions, member, frame, n) for member in body.members])
+            body.joined_codes(
+                [
+                    codes_of[member.name][frame] if member.name in codes_of else None
+                    for member in body.members
+                ]
+            )
             for frame in range(n)
         ]
     )
-    shaped = [
-        played
-        for played in motions
-        if played.motion is not None and played.motion.space_at is not None
-    ]
-    space = body.space
+    names = " + ".join(dict.fromkeys(motion.name for _, motion in moving))
+    files = dict.fromkeys(played.file.name for played, _ in moving if played.file is not None)
+    space_at = _space_at(body, moving)
+    return Motion(names, np.arange(n) / rate, codes, None, space_at, " + ".join(files)), motions
+
+
+def _space_at(
+    body: SceneBody, moving: Sequence[tuple[PlayedMotion, Motion]]
+) -> Callable[[float], Any] | None:
+    """Return what makes the pose space of a scene at a frame; None if it is the same in all.
+
+    Raises
+    ------
+    LCollisionError : a body whose shape changes holds a prop.
+    """
+    shaped = [(played, motion) for played, motion in moving if motion.space_at is not None]
+    holders = {member.holder for member in body.members}
+    for played, _ in shaped:
+        if played.member.name in holders:
+            raise LCollisionError(
+                "scales its joints or weighs morph targets, so it can't hold a prop",
+                "leave the prop out",
+                where=played.member.name,
+            )
+    space, standing = body.space, [member.name for member in body.standing]
 
     def space_at(time: float) -> Any:
         spaces = [placed.space for placed in space.members]
-        for one in shaped:
-            assert one.motion is not None
-            last = len(one.motion) - 1
-            frame_space = one.motion.space(
-                float(np.clip(time - one.start, 0, last)), one.member.body.space
+        for played, motion in shaped:
+            frame = float(np.clip(time - played.start, 0, len(motion) - 1))
+            spaces[standing.index(played.member.name)] = motion.space(
+                frame, played.member.body.space
             )
-            at = [member.name for member in body.standing].index(one.member.name)
-            spaces[at] = frame_space
         return space.with_spaces(spaces)
 
-    holders = {member.holder for member in body.members}
-    if any(moved.member.name in holders for moved in shaped):
-        raise LCollisionError(
-            "scales its joints or weighs morph targets, so it can't hold a prop",
-            "leave the prop out",
-            where=next(moved.member.name for moved in shaped if moved.member.name in holders),
-        )
-    names = dict.fromkeys(played.motion.name for played in motions if played.motion is not None)
-    motion = Motion(
-        " + ".join(names),
-        np.arange(n) / rate,
-        codes,
-        None,
-        space_at if shaped else None,
-        " + ".join(
-            dict.fromkeys(played.file.name for played in motions if played.file is not None)
-        ),
-    )
-    return motion, motions
-
-
-def _codes_of(
-    found: Sequence[PlayedMotion], member: SceneMember, frame: int, n: int
-) -> npt.NDArray[np.float64] | None:
-    own_motion = next((played for played in found if played.member is member), None)
-    if own_motion is None or own_motion.motion is None:
-        return None
-    codes: npt.NDArray[np.float64] = own_motion.motion.codes[own_motion.frames(n)[frame]]
-    return codes
+    return space_at if shaped else None
 
 
 def _asked_clips(
@@ -471,9 +462,9 @@ def write_member_motions(
     check, n = body.exact_check(), len(after)
     by_name = {member_motion.member.name: member_motion for member_motion in played}
     for member, file in written_members(body):
-        one, path = by_name.get(member.name), folder / file
+        played_motion, path = by_name.get(member.name), folder / file
         own_file = member.body.own_file
-        is_character = one is not None and member.body.latent_size > 6
+        is_character = played_motion is not None and member.body.latent_size > 6
         if not is_character or own_file is None or own_file.suffix.lower() not in SCENE_SUFFIXES:
             rows, back = body.vertices_of[member.name], member.place.inverse()
             path = path.with_suffix(".pc2")
@@ -481,16 +472,17 @@ def write_member_motions(
             codes = [np.zeros(member.body.latent_size)] * n
             write_sequence(path, member.body, codes, meshes, ExportRequest(fps=after.rate))
         else:
-            assert one is not None
+            assert played_motion is not None
             new = body.codes_of_member(member.name, after.codes)
             old = body.codes_of_member(member.name, before.codes)
-            motion = one.motion
-            is_own = one.file is not None and not is_retargeted(member.body, one.file)
+            motion, source = played_motion.motion, played_motion.file
+            is_own = source is not None and not is_retargeted(member.body, source)
             if motion is None or not is_own:
                 name = before.name if motion is None else motion.name
                 write_new_clips(path, member.body, [Motion(name, after.times, new)])
             else:
-                frame_rows = slice(one.start, one.start + len(motion))
+                first = played_motion.start
+                frame_rows = slice(first, first + len(motion))
                 changed = replace(motion, codes=np.array(new[frame_rows]))
                 spans = runs((old[frame_rows] != new[frame_rows]).any(axis=1))
                 change = MotionChange(motion, changed, spans)
