@@ -102,8 +102,12 @@ def check(
     """
     choose_device(device, note)
     from lcollision_core.files import require_writable
-    from lcollision_core.files.safe import atomic_write
-    from lcollision_core.tasks.checking import CheckRequest, check_clips, check_mesh, table_of
+    from lcollision_core.tasks.checking import (
+        CheckRequest,
+        check_clips,
+        check_mesh,
+        write_clips_table,
+    )
     from lcollision_core.tasks.inputs import holds_motion, mesh_files_of, motion_files_of
 
     as_clips = [clips or holds_motion(path) for path in meshes]
@@ -160,8 +164,7 @@ def check(
         for line in checked_clip_table(checked_clips):
             tell(line)
     if table is not None:
-        with atomic_write(table) as file:
-            file.write(table_of(checked_clips).encode())
+        write_clips_table(table, checked_clips)
     if failed:
         raise typer.Exit(ExitStatus.BAD_INPUT)
     if any(verdict.colliding for verdict in verdicts):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -215,7 +213,7 @@ def _write_samples(
     scored: ScoredRows, numbers: npt.NDArray[np.int64], threshold: float, path: Path
 ) -> None:
     """Write each sample's labels, estimates and verdict; the file is complete or absent."""
-    from lcollision_core.files import atomic_write
+    from lcollision_core.files.safe import write_table
 
     rows, scale = scored.rows, scored.predictor.facts.energy_scale
     columns = {
@@ -227,12 +225,8 @@ def _write_samples(
         "probability": scored.probability,
         "predicted_energy": scored.domain_energy.clip(0.0).sum(axis=1) * scale,
     }
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(columns)
-    table.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
-    with atomic_write(path) as file:
-        file.write(text.getvalue().encode())
+    values = zip(*(column.tolist() for column in columns.values()), strict=True)
+    write_table(path, columns, (dict(zip(columns, row, strict=True)) for row in values))
 
 
 def _with_figures(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
 import math
 import os
 import re
@@ -215,6 +217,23 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     finally:
         with suppress(OSError):
             unfinished.unlink(missing_ok=True)
+
+
+def write_table(
+    path: str | os.PathLike[str], columns: Iterable[str], rows: Iterable[Mapping[str, object]]
+) -> None:
+    """Write a CSV table with a header, as `atomic_write` does; values of other names are left out.
+
+    Raises
+    ------
+    MeshFileError : as in `atomic_write`.
+    """
+    text = io.StringIO()
+    table = csv.DictWriter(text, list(columns), extrasaction="ignore", lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    with atomic_write(path) as file:
+        file.write(text.getvalue().encode())
 
 
 @contextmanager

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -19,6 +17,7 @@ from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files import audit_mesh, read_mesh, read_pose_set
 from lcollision_core.files.animated import frame_rate
 from lcollision_core.files.motion.generated import is_generated
+from lcollision_core.files.safe import write_table
 from lcollision_core.files.scene_files import open_rigged, read_scene
 from lcollision_core.files.table import ANIMATED_SUFFIXES, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
@@ -399,15 +398,16 @@ def _verdict(
     )
 
 
-def table_of(verdicts: Iterable[CheckedClip]) -> str:
-    """Return a CSV table with a row for each frame with pairs; depths are in body sizes.
+def write_clips_table(path: Path, verdicts: Iterable[CheckedClip]) -> None:
+    """Write a CSV table with a row for each frame with pairs; depths are in body sizes.
 
     A free frame with excluded pairs has 0 pairs.
+
+    Raises
+    ------
+    MeshFileError : it cannot be written.
     """
-    names = [column.name for column in fields(CheckedFrame)]
-    table = io.StringIO()
-    writer = csv.DictWriter(table, ["file", "clip", *names], lineterminator="\n")
-    writer.writeheader()
+    rows = []
     for verdict in verdicts:
         frames = (*verdict.colliding_frames, *verdict.excluding_frames)
         for frame in sorted(frames, key=lambda frame: frame.frame):
@@ -415,8 +415,8 @@ def table_of(verdicts: Iterable[CheckedClip]) -> str:
             row["parts"] = " ".join(f"{a}:{b}" for a, b in frame.parts)
             rules = frame.excluded_rules or {}
             row["excluded_rules"] = " ".join(f"{rule}:{n}" for rule, n in rules.items() if n)
-            writer.writerow(row)
-    return table.getvalue()
+            rows.append(row)
+    write_table(path, ("file", "clip", *(column.name for column in fields(CheckedFrame))), rows)
 
 
 _AnyBody = TypeVar("_AnyBody", bound="Body")

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 import time
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, closing
 from dataclasses import asdict, dataclass, fields, replace
@@ -18,7 +16,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.files import file_stamp
-from lcollision_core.files.safe import atomic_write
+from lcollision_core.files.safe import write_table
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.options import ExportRequest, MotionChoice, MotionOptions, ResolveOptions
 from lcollision_core.tasks.exporting import (
@@ -585,14 +583,13 @@ def _inputs_of_motions(
     values = {**values, "files": [_stamp(path) for path in files]}
     for number, motion in enumerate(motions):
         arrays |= {f"codes {number}": motion.codes, f"times {number}": motion.times}
-    settings = {
-        "easing": options.easing,
-        "substeps": options.substeps,
-        "continuous": options.continuous,
-    }
-    feet = {"keep_feet": options.keep_feet, "feet": sorted(options.feet)}
-    feet["keep_contacts"] = options.keep_contacts
-    return arrays, {**values, **settings, **feet, "command": "resolve --motion"}
+    return arrays, {**values, **_settings(options), "command": "resolve --motion"}
+
+
+def _settings(options: MotionOptions) -> dict[str, Any]:
+    """Return options that the result of a motion depends on, as JSON values."""
+    names = ("easing", "substeps", "continuous", "keep_feet", "keep_contacts")
+    return {name: getattr(options, name) for name in names} | {"feet": sorted(options.feet)}
 
 
 # Folders of motions.
@@ -649,8 +646,7 @@ def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
                 seconds_left = spent * (n_bytes - n_bytes_done) / max(n_bytes_done, 1)
                 job.report(FolderStatus(len(run.done), len(files), rows, seconds_left))
         row_values = [values for name in paths for values in run.done[name]["rows"]]
-        with atomic_write(folder / _TABLE) as file:
-            file.write(_table_of(row_values).encode())
+        write_table(folder / _TABLE, _COLUMNS, map(_row_of_table, row_values))
     job.note(say("wrote {file}", file=folder / _TABLE))
     return [_row_of(values) for values in row_values]
 
@@ -774,16 +770,12 @@ def _name(path: Path, root: Path | None) -> str:
     return path.name if root is None else path.relative_to(root).as_posix()
 
 
-_CHOSEN = ("easing", "keep_feet", "keep_contacts", "budget")
-
-
 def _key_of_folder(request: ResolveMotionsRequest) -> str:
     options = request.options
     arrays, values = depends_on(request.body, options.frame)
-    settings = {name: getattr(options, name) for name in _CHOSEN}
-    settings |= {"feet": sorted(options.feet), "only_check": request.only_check}
-    settings |= {"resolved": [options.substeps, options.continuous]}
-    return key_of(request.body, arrays, {**values, **settings, **asdict(request.choice)})
+    values |= _settings(options) | {"choice": asdict(request.choice)}
+    values |= {"budget": options.budget, "only_check": request.only_check}
+    return key_of(request.body, arrays, values)
 
 
 def _stamp(path: Path) -> list[int]:
@@ -800,13 +792,8 @@ _COLUMNS = (
 )
 
 
-def _table_of(rows: Iterable[dict[str, Any]]) -> str:
-    table = io.StringIO()
-    writer = csv.DictWriter(table, _COLUMNS, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        kept_text = "; ".join(span["sentence"] for span in row.get("kept_spans", ()))
-        contacts = row.get("contacts") or {}
-        counts = {f"contacts_{name}": len(contacts.get(name, ())) for name in ("kept", "lost")}
-        writer.writerow({**row, "kept": kept_text, **counts})
-    return table.getvalue()
+def _row_of_table(row: dict[str, Any]) -> dict[str, Any]:
+    kept_text = "; ".join(span["sentence"] for span in row.get("kept_spans", ()))
+    contacts = row.get("contacts") or {}
+    counts = {f"contacts_{name}": len(contacts.get(name, ())) for name in ("kept", "lost")}
+    return {**row, "kept": kept_text, **counts}
