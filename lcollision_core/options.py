@@ -345,11 +345,16 @@ class ResolveOptions:
     ] = Metric.DISPLACEMENT
     threshold: Annotated[
         float,
-        Option("Decision threshold: up to this probability a pose is predicted free.", metavar="P"),
+        Option(
+            "Decision threshold: up to this probability a pose is predicted free.",
+            metavar="P",
+            above=0.0,
+            below=1.0,
+        ),
     ] = 0.5
     margin: Annotated[
         float | None,
-        Option("How far below the threshold's logit the first step aims.", metavar="X"),
+        Option("How far below the threshold's logit the first step aims.", metavar="X", low=0.0),
     ] = None
     locked_domains: frozenset[int] = field(default_factory=frozenset)
     locked_codes: frozenset[int] = field(default_factory=frozenset)
@@ -358,7 +363,11 @@ class ResolveOptions:
     group_weights: tuple[float, ...] | None = None
     time_budget: Annotated[
         float | None,
-        Option("Search time per pose; after that, a known free pose is used.", metavar="SECONDS"),
+        Option(
+            "Search time per pose; after that, a known free pose is used.",
+            metavar="SECONDS",
+            above=0.0,
+        ),
     ] = None
     verify: Annotated[
         bool,
@@ -387,6 +396,7 @@ class ResolveOptions:
             "result is the pose found with the least overlap, or the pose as it was.",
             ("--largest-change", "--soft"),
             metavar="MAX",
+            above=0.0,
         ),
     ] = LARGEST_CHANGE
 
@@ -399,23 +409,9 @@ class ResolveOptions:
                 raise LCollisionError(
                     f"unknown {name} {given!r}", f"choose one of {', '.join(kind)}"
                 ) from None
-        if not 0.0 < self.threshold < 1.0:
-            raise LCollisionError.must_be(
-                "the threshold", "a probability between 0 and 1", f"{self.threshold:g}"
-            )
-        if self.margin is not None and not 0.0 <= self.margin < math.inf:
-            raise LCollisionError.must_be("the margin", "0 or more", f"{self.margin:g}")
-        if self.largest_change is not None:
-            if not 0.0 < self.largest_change < math.inf:
-                allowed, got = "a number of body sizes above 0", f"{self.largest_change:g}"
-                raise LCollisionError.must_be("the largest change", allowed, got)
-            if not self.verify and self.largest_change != LARGEST_CHANGE:
-                what = "a largest change needs the exact check"
-                raise LCollisionError(what, "leave out --no-verify or --largest-change")
-        if self.time_budget is not None and not self.time_budget > 0.0:
-            raise LCollisionError.must_be(
-                "the time budget", "more than 0 seconds", f"{self.time_budget:g}"
-            )
+        if not self.verify and self.largest_change not in (None, LARGEST_CHANGE):
+            what = "a largest change needs the exact check"
+            raise LCollisionError(what, "leave out --no-verify or --largest-change")
         if self.group_weights is not None and not all(
             0.0 < weight < math.inf for weight in self.group_weights
         ):

@@ -49,6 +49,7 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
     from lcollision_core.errors import MeshFileError, ShapeError
     from lcollision_core.files import inspect_pose_set
     from lcollision_core.meshes import degenerate_faces, groups_by_kind
+    from lcollision_core.tasks.inputs import with_rules
 
     with progress_bar("Reading poses") as job:
         inspection = inspect_pose_set(path, job)
@@ -57,14 +58,10 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
         raise inspection.defects[0]
     for remark in poses.notes:
         note(f"{path}: {remark}")
-    from lcollision_core.tasks.inputs import with_rules_of_character
-
-    poses = with_rules_of_character(poses, path)
+    poses = with_rules(poses, path, options)
+    rules = poses.rules
     try:
-        rules, groups = options.applied(
-            poses.rules, poses.groups, poses.topology, poses.vertex_labels
-        )
-        detector = CollisionDetector(poses.topology, poses.vertices[0], rules, groups)
+        detector = CollisionDetector(poses.topology, poses.vertices[0], rules, poses.groups)
         with progress_bar("Finding self-collisions") as job:
             collisions = detector.detect_batch(poses.vertices, job=job)
     except ShapeError as error:

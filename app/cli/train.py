@@ -87,13 +87,13 @@ def embedding(
     from lcollision_core.bodies import checkpoint_path, model_destination, save_trained
     from lcollision_core.embedding.training_run import EmbeddingConfig
     from lcollision_core.files import file_stamp, read_pose_set, require_writable
-    from lcollision_core.tasks.inputs import with_rules_of_character
+    from lcollision_core.tasks.inputs import with_rules
     from lcollision_core.tasks.learning import learn_latent_space
 
     destination = model_destination(output)
     require_writable(destination)
     before = file_stamp(destination)
-    poses = with_rules_of_character(read_pose_set(dataset), dataset)
+    poses = with_rules(read_pose_set(dataset), dataset, options)
     if scale != 1.0:
         poses = poses.scaled(scale)
     guess = poses.up
@@ -102,8 +102,6 @@ def embedding(
     poses = replace(poses, up_axis=guess.axis if up is None else "xyz".index(up))
     for remark in poses.notes:
         note(f"{dataset}: {remark}")
-    rules, groups = options.applied(poses.rules, poses.groups, poses.topology, poses.vertex_labels)
-    poses = replace(poses, rules=rules, groups=groups)
     config = EmbeddingConfig(
         n_domains=n_domains, n_domain_codes=n_codes, encoded_codes=encoded_codes
     )

@@ -39,6 +39,7 @@ from lcollision_core.tasks.words import fit_error, say, say_number
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, NamedPose
     from lcollision_core.files import PoseSet
+    from lcollision_core.options import RuleOptions
     from lcollision_core.tasks.exporting import Output
 
 _OF_MOTIONS = (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES)
@@ -188,15 +189,21 @@ def body_of_motion(body: Body, path: Path, job: Job) -> Body:
     return body
 
 
-def with_rules_of_character(poses: PoseSet, path: Path) -> PoseSet:
-    """Give the frames of a rigged character the contact rules of the posed character."""
+def with_rules(poses: PoseSet, path: Path, options: RuleOptions) -> PoseSet:
+    """Return poses read from a file with the rules of its character, if any, and the options.
+
+    Raises
+    ------
+    LCollisionError : an option names an unknown group.
+    """
     from lcollision_core.bodies import open_body
 
     document = open_rigged(path)
-    if document is None:
-        return poses
-    body = open_body(document)
-    return replace(poses, rules=body.rules, groups=body.groups)
+    if document is not None:
+        body = open_body(document)
+        poses = replace(poses, rules=body.rules, groups=body.groups)
+    rules, groups = options.applied(poses.rules, poses.groups, poses.topology, poses.vertex_labels)
+    return replace(poses, rules=rules, groups=groups)
 
 
 @dataclass(frozen=True, eq=False)

@@ -429,18 +429,18 @@ def test_a_sequence_is_resolved_as_a_motion_and_told_to_be_deprecated(
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (("--threshold", "0"), "the threshold must be a probability between 0 and 1, got 0"),
-        (("--threshold", "1.5"), "the threshold must be a probability between 0 and 1, got 1.5"),
+        (("--threshold", "0"), "the threshold must be over 0.0, got 0"),
+        (("--threshold", "1.5"), "--threshold': Input should be less than or equal to 1"),
         (("--solver", "magic"), "unknown solver 'magic'; choose one of sqp, auglag"),
         (("--metric", "near"), "unknown metric 'near'; choose one of vertices, latent"),
-        (("--margin", "-2"), "the margin must be 0 or more, got -2"),
+        (("--margin", "-2"), "--margin': Input should be greater than or equal to 0"),
         (("--lock", "tail"), "has no domain 'tail'; its domains are"),
         (("--lock", "0"), "has no domain '0'; its domains are"),
         (("--weight", "1"), "--weight '1' is not DOMAIN=W"),
         (("--weight", "1=-3"), "--weight '1=-3' is not DOMAIN=W"),
-        (("--time-budget", "0"), "the time budget must be more than 0 seconds, got 0"),
+        (("--time-budget", "0"), "the time budget must be over 0.0, got 0"),
         (("--keep-detail",), "--keep-detail applies only to meshes"),
-        (("--soft", "0"), "the largest change must be a number of body sizes above 0, got 0"),
+        (("--soft", "0"), "the largest change must be over 0.0, got 0"),
         (("--soft", "0.1", "--no-verify"), "a largest change needs the exact check; leave out"),
     ],
 )

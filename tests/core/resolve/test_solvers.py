@@ -228,20 +228,20 @@ def test_sqp_run_in_pieces_is_the_same_run() -> None:
     [
         ({"solver": "simplex"}, "unknown solver 'simplex'; choose one of sqp, auglag"),
         ({"metric": "taxicab"}, "unknown metric 'taxicab'; choose one of vertices, latent"),
-        ({"threshold": 0.0}, "between 0 and 1, got 0"),
-        ({"threshold": 1.0}, "between 0 and 1, got 1"),
-        ({"threshold": float("nan")}, "between 0 and 1, got nan"),
-        ({"margin": -1.0}, "margin must be 0 or more, got -1"),
-        ({"margin": float("inf")}, "margin must be 0 or more, got inf"),
-        ({"time_budget": 0.0}, "more than 0 seconds, got 0"),
+        ({"threshold": 0.0}, "the threshold must be over 0.0, got 0"),
+        ({"threshold": 1.0}, "the threshold must be below 1.0, got 1"),
+        ({"threshold": float("nan")}, "the threshold must be over 0.0, got nan"),
+        ({"margin": -1.0}, "margin must be at least 0.0, got -1"),
+        ({"margin": float("inf")}, "margin must be finite, got inf"),
+        ({"time_budget": 0.0}, "the time budget must be over 0.0, got 0"),
         ({"group_weights": (1.0, 0.0)}, "weight must be a number above 0"),
         ({"seed": -1}, "the seed must be at least 0, got -1"),
         ({"clearance": 1.0}, "the clearance must be below 1.0, got 1"),
         ({"clearance": -0.1}, "the clearance must be at least 0.0, got -0.1"),
         ({"clearance": float("nan")}, "the clearance must be at least 0.0, got nan"),
         *(
-            ({"largest_change": most}, "the largest change must be a number of body sizes above 0")
-            for most in (0.0, -0.1, float("inf"), float("nan"))
+            ({"largest_change": most}, f"the largest change must be {expected}, got {most:g}")
+            for most, expected in ((0.0, "over 0.0"), (float("inf"), "finite"))
         ),
     ],
 )
