@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
 from pathlib import Path
 from typing import Annotated
 
@@ -57,24 +56,3 @@ def edit(
         body = open_body(name)
         keep_rules(name, body, body.with_options(rules).rules)
     raise typer.Exit(open_editor(file, model_name))
-
-
-def with_command(words: list[str], commands: Container[str]) -> list[str]:
-    """Insert "edit" before words that start with a path or with the editor's option `--model`.
-
-    Parameters
-    ----------
-    words : everything after the program's name
-    commands : the names of commands, which are not taken as files
-    """
-    first = words[0] if words else ""
-    path = Path(first)
-    names_file = bool(first) and (path.exists() or bool(path.suffix) or len(path.parts) > 1)
-    is_file = names_file and first not in commands and not first.startswith("-")
-    return ["edit", *words] if is_file or first.partition("=")[0] == "--model" else words
-
-
-def edit_without_command(context: typer.Context) -> None:
-    """Open the editor if no command was given; for the callback of the whole program."""
-    if context.invoked_subcommand is None:
-        edit()

@@ -1,6 +1,7 @@
 """The commands, and the handling of errors.
 
-Every command imports its modules when it runs: ``lcollision --help`` loads no array library.
+A command's file is imported when the command is asked for, and what it works with when it runs:
+``lcollision --help`` loads no array library.
 """
 
 from __future__ import annotations
@@ -10,28 +11,17 @@ import logging
 import os
 import sys
 import traceback
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
 
-from app.cli import (
-    benchmark,
-    check,
-    contacts,
-    dataset,
-    edit,
-    evaluate,
-    label,
-    models,
-    new,
-    poses,
-    printing,
-    resolve,
-    serve,
-    train,
-)
 from app.cli.console import ExitStatus, note, tell_what_takes_time
+from lcollision_core import __version__
 from lcollision_core.errors import CancelledError, LCollisionError
 
 # Small matrix products take microseconds; on a busy machine, distributing them takes longer.
@@ -43,7 +33,60 @@ _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 """Typer's usage error; only this subclass has a public name."""
 
 
-def with_height(words: list[str]) -> list[str]:
+_COMMANDS = {
+    "edit": "edit.edit",
+    "new": "new.new",
+    "models": "models.models",
+    "info": "models.info",
+    "domains": "models.domains",
+    "upright": "models.upright",
+    "contacts": "contacts.contacts",
+    "check": "check.check",
+    "encode": "poses.encode",
+    "decode": "poses.decode",
+    "sample": "poses.sample",
+    "mirror": "poses.mirror",
+    "resolve": "resolve.resolve",
+    "label": "label.label",
+    "evaluate": "evaluate.evaluate",
+    "serve": "serve.serve",
+    "blender-addon": "serve.blender_addon",
+    "print": "printing.print_figure",
+    "dataset": "dataset.app",
+    "train": "train.app",
+    "benchmark": "benchmark.app",
+}
+"""The file of `app.cli` and the name in it of each command or group, in the order of the help."""
+
+
+@cache
+def _command(name: str) -> Any:
+    """Import a command or a group."""
+    file, attribute = _COMMANDS[name].split(".")
+    command = getattr(import_module(f"app.cli.{file}"), attribute)
+    home = typer.Typer(add_completion=False, rich_markup_mode=None, callback=lambda: None)
+    if isinstance(command, typer.Typer):
+        home.add_typer(command, name=name)
+    else:
+        home.command(name)(command)
+    group: Any = typer.main.get_command(home)
+    return group.commands[name]
+
+
+class _CommandsByName(Mapping[str, Any]):
+    """Imports a command when it is looked up."""
+
+    def __getitem__(self, name: str) -> Any:
+        return _command(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_COMMANDS)
+
+    def __len__(self) -> int:
+        return len(_COMMANDS)
+
+
+def _with_height(words: list[str]) -> list[str]:
     """Allow `--ground` without a height: it means the height at which the bodies rest."""
     following = [*words, ""][1:]
 
@@ -59,12 +102,28 @@ def with_height(words: list[str]) -> list[str]:
     ]
 
 
+def _with_command(words: list[str]) -> list[str]:
+    """Insert "edit" before words that start with a path or with the editor's option `--model`.
+
+    A command's name is not taken as a file.
+    """
+    first = words[0] if words else ""
+    path = Path(first)
+    names_file = bool(first) and (path.exists() or bool(path.suffix) or len(path.parts) > 1)
+    is_file = names_file and first not in _COMMANDS and not first.startswith("-")
+    return ["edit", *words] if is_file or first.partition("=")[0] == "--model" else words
+
+
 class _Commands(TyperGroup):
     """Prints errors that a user can fix as one sentence."""
 
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands: Any = _CommandsByName()
+
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
         """Insert "edit" if the words can only be meant for the editor."""
-        return super().parse_args(ctx, edit.with_command(with_height(args), self.commands))
+        return super().parse_args(ctx, _with_command(_with_height(args)))
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         try:
@@ -121,28 +180,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (
-    edit.edit,
-    new.new,
-    *(models.models, models.info, models.domains, models.upright),
-    contacts.contacts,
-    check.check,
-    *(poses.encode, poses.decode, poses.sample, poses.mirror),
-    *(resolve.resolve, label.label, evaluate.evaluate),
-    *(serve.serve, serve.blender_addon),
-):
-    app.command()(command)
-app.command("print")(printing.print_figure)
-app.add_typer(dataset.app, name="dataset")
-app.add_typer(train.app, name="train")
-app.add_typer(benchmark.app, name="benchmark")
 
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        from importlib.metadata import version
-
-        typer.echo(f"lcollision {version('lcollision')}")
+        typer.echo(f"lcollision {__version__}")
         raise typer.Exit
 
 
@@ -155,7 +197,10 @@ def _global_options(
     ] = False,
 ) -> None:
     tell_what_takes_time()
-    edit.edit_without_command(context)
+    if context.invoked_subcommand is None:
+        from app.cli.edit import edit
+
+        edit()
 
 
 def main() -> None:

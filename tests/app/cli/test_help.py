@@ -13,8 +13,8 @@ from tests.app.support import Lcollision
 
 
 def _loaded_modules(code: str) -> set[str]:
-    """Run code in a fresh interpreter and return the top-level modules that it loaded."""
-    report = "import sys; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    """Run code in a fresh interpreter and return the modules that it loaded."""
+    report = "import sys; print(*sys.modules)"
     result = subprocess.run(
         [sys.executable, "-c", f"{code}\n{report}"], capture_output=True, text=True, check=True
     )
@@ -27,6 +27,17 @@ HEAVY = {"numpy", "scipy", "numba", "torch", "trimesh", "vtkmodules", "pyvista",
 def test_importing_the_command_line_loads_nothing_heavy() -> None:
     loaded = _loaded_modules("import app.cli.main")
     assert "typer" in loaded
+    assert loaded & HEAVY == set()
+
+
+def test_a_start_loads_the_file_of_its_command_alone() -> None:
+    loaded = _loaded_modules(
+        "from app.cli.main import app\napp(['check', '--help'], standalone_mode=False)"
+    )
+    files = {path.stem for path in (Path(__file__).parents[3] / "app" / "cli").glob("*.py")}
+    commands = {"check", "resolve", "models", "benchmark", "train", "edit"}
+    assert commands < files
+    assert {name for name in commands if f"app.cli.{name}" in loaded} == {"check"}
     assert loaded & HEAVY == set()
 
 
