@@ -78,7 +78,7 @@ def jumping() -> PoseSet:
     return _published_set("jumping150.npz")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def lcollision() -> Lcollision:
     """Run ``lcollision ARGUMENTS``; the result has exit_code, stdout and stderr."""
 

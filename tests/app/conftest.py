@@ -156,16 +156,17 @@ def _begin(qtbot: QtBot, document: PoseDocument, model: LearnedBody) -> None:
     document.history.undo_stack.clear()
     document.history.mark_saved()
 
-    def settle() -> None:
+    def is_settled() -> bool:
         # The frame with the prediction follows one without; either may be checked.
         motion = document.motion
-        frame, exact = motion.frame, motion.exact
-        assert frame is not None, "no frame has come"
-        assert frame.prediction is not None, "the predictor has not been loaded"
-        assert exact is not None, "no verdict has come"
-        assert motion.unchecked is None, "the newest frame has not been checked"
+        return (
+            motion.frame is not None
+            and motion.frame.prediction is not None
+            and motion.exact is not None
+            and motion.unchecked is None
+        )
 
-    qtbot.waitUntil(settle, timeout=20_000)
+    qtbot.waitUntil(is_settled, timeout=20_000)
 
 
 def shares_window(request: pytest.FixtureRequest) -> bool:

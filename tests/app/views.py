@@ -28,20 +28,19 @@ def dispose(shown: Viewport) -> None:
 def rest(qtbot: QtBot, viewport: Viewport) -> None:
     """Wait until the smooth picture of the newest pose is on the screen."""
 
-    def settle() -> None:
-        frame, document = viewport.shown_frame, viewport._document
-        assert frame is not None, "no pose has been shown"
-        newest = (
-            document.motion.frame is not None
-            and document.motion.frame.latent is document.history.latent
+    # Booleans: pytest formats the operands of a failed assertion, here whole frames, at each look.
+    def is_settled() -> bool:
+        motion, canvas = viewport._document.motion, viewport.canvas
+        return (
+            motion.frame is not None
+            and motion.frame.latent is viewport._document.history.latent
+            and viewport.shown_frame is motion.frame
+            and canvas is not None
+            and canvas.is_settled
+            and viewport.is_at_rest
         )
-        assert newest, "the frame of the newest pose has not come"
-        assert frame is document.motion.frame, "the newest frame is not shown"
-        assert viewport.canvas is not None
-        assert viewport.canvas.is_settled, "the smooth picture has not been drawn"
-        assert viewport.is_at_rest, "something is animated"
 
-    qtbot.waitUntil(settle, timeout=20_000)
+    qtbot.waitUntil(is_settled, timeout=20_000)
 
 
 def pixels(viewport: Viewport) -> npt.NDArray[np.int64]:

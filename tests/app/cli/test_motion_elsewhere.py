@@ -37,10 +37,12 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_gltf(swinging_body(begin=0.3), tmp_path_factory.mktemp("clips") / "source.glb")
 
 
-@pytest.fixture
-def free(lcollision: Lcollision, source: Path, tmp_path: Path) -> Path:
-    path = tmp_path / "free.glb"
-    result = lcollision("resolve", source, "--motion", "--clip", CLIP, "-o", path)
+@pytest.fixture(scope="module")
+def free(lcollision: Lcollision, source: Path) -> Path:
+    path = source.with_name("free.glb")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_DATA_HOME", str(source.parent))
+        result = lcollision("resolve", source, "--motion", "--clip", CLIP, "-o", path)
     assert result.exit_code == 0, result.output
     return path
 

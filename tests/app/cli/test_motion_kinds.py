@@ -54,10 +54,7 @@ def key_times(path: Path, clip: str) -> np.ndarray:
 
 @pytest.mark.parametrize(
     "kind",
-    [
-        pytest.param(kind, marks=() if kind in ("25 metres", "2 frames") else pytest.mark.slow)
-        for kind in KINDS
-    ],
+    [pytest.param(kind, marks=() if kind == "2 frames" else pytest.mark.slow) for kind in KINDS],
 )
 def test_a_clip_of_any_kind_comes_back_free_and_whole(
     lcollision: Lcollision, tmp_path: Path, kind: str
@@ -333,7 +330,13 @@ def test_a_body_without_bones_of_vrm_is_refused_before_its_motion_is_resolved(
     assert not path.exists()
 
 
-@pytest.mark.parametrize("file", SHAPED, ids=lambda file: file.stem)
+@pytest.mark.parametrize(
+    "file",
+    [
+        pytest.param(file, id=file.stem, marks=[pytest.mark.slow] * (file.stem == "arm_morph"))
+        for file in SHAPED
+    ],
+)
 def test_what_shapes_a_frame_turns_with_its_joints_in_every_form(
     lcollision: Lcollision, tmp_path: Path, file: Path
 ) -> None:

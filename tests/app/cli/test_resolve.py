@@ -135,7 +135,8 @@ def test_poses_come_back_free_in_their_order(
 
 
 @pytest.mark.parametrize(
-    "solver", ["auglag", pytest.param("slsqp", marks=pytest.mark.slow), "ccsaq"]
+    "solver",
+    ["auglag", *(pytest.param(name, marks=pytest.mark.slow) for name in ("slsqp", "ccsaq"))],
 )
 def test_every_solver_by_its_name(
     lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path, solver: str

@@ -261,7 +261,9 @@ def test_the_legend_is_laid_out_while_nothing_is_painted(qtbot: QtBot, viewport:
     assert watch.meanwhile == []
 
 
-@pytest.mark.parametrize("width", [160, 300, 420, 900])
+@pytest.mark.parametrize(
+    "width", [160, 420, *(pytest.param(width, marks=pytest.mark.slow) for width in (300, 900))]
+)
 def test_the_legend_lies_beneath_the_mesh_and_holds_still_while_a_pose_changes(
     qtbot: QtBot,
     document: PoseDocument,

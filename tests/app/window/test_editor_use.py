@@ -285,7 +285,14 @@ def test_of_several_platforms_one_that_works_suffices() -> None:
     assert why_no_window({**os.environ, "QT_QPA_PLATFORM": "wayland;offscreen"}, "linux") is None
 
 
-@pytest.mark.parametrize("words", [(), ("edit",), ("wayland",)], ids=["alone", "edit", "wayland"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        pytest.param((), id="alone"),
+        pytest.param(("edit",), id="edit", marks=pytest.mark.slow),
+        pytest.param(("wayland",), id="wayland", marks=pytest.mark.slow),
+    ],
+)
 def test_without_a_display_one_sentence_names_what_works_there(words: tuple[str, ...]) -> None:
     hidden = ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM")
     environment = {key: value for key, value in os.environ.items() if key not in hidden}

@@ -85,7 +85,17 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+BETWEEN = {f"{size:g}" for size in 10.0 ** -np.array([4, 6, 10, 12, 14])}
+"""Sizes within the series of `KINDS`, whose ends and middle are tested by default."""
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(kind, marks=[pytest.mark.slow] if BETWEEN & set(kind.split()) else ())
+        for kind in KINDS
+    ],
+)
 def test_distance_is_that_of_exact_arithmetic(kind: str) -> None:
     a, b = KINDS[kind].transpose(1, 0, 2, 3)
     expected = np.array([exact_distance(*pair) for pair in KINDS[kind]])

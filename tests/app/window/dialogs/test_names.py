@@ -49,28 +49,34 @@ def work(
     return tmp_path
 
 
+MORE = (
+    f"sample m.safetensors -n 1 -o {LONG}.json",
+    f"encode m.safetensors mesh.obj -o {LONG}.json",
+    f"decode m.safetensors p.json -o {LONG}.obj",
+    f"decode m.safetensors {LONG}.json -o out",
+    f"resolve m.safetensors p.json -o {LONG}.json",
+    f"label m.safetensors -n 1 -o {LONG}",
+    f"train embedding set.npz -o {LONG}",
+    f"train embedding set.npz -o {LONG}.safetensors",
+    f"train predictor m.safetensors store -o {'x' * 236}.safetensors",
+    f"info {LONG}",
+    f"dataset check {LONG}",
+    f"dataset make body -o {LONG}.npz",
+)
+"""Commands of the same kinds."""
+
+
 @pytest.mark.parametrize(
     "command",
     [
-        f"sample m.safetensors -n 1 -o {LONG}.json",
-        f"encode m.safetensors mesh.obj -o {LONG}.json",
         f"decode m.safetensors p.json -o {LONG}",
-        f"decode m.safetensors p.json -o {LONG}.obj",
-        f"decode m.safetensors {LONG}.json -o out",
         f"resolve m.safetensors {LONG} -o out",
-        f"resolve m.safetensors p.json -o {LONG}.json",
-        f"label m.safetensors -n 1 -o {LONG}",
-        f"train embedding set.npz -o {LONG}",
-        f"train embedding set.npz -o {LONG}.safetensors",
         # The model's name would fit, but not that of its checkpoint.
         f"train embedding set.npz -o {'x' * 236}.safetensors",
-        f"train predictor m.safetensors store -o {'x' * 236}.safetensors",
         f"info m.safetensors --figure {LONG}.png",
-        f"info {LONG}",
         f"check {LONG}.obj",
-        f"dataset check {LONG}",
-        f"dataset make body -o {LONG}.npz",
         f"edit {LONG}.json",
+        *(pytest.param(command, marks=pytest.mark.slow) for command in MORE),
     ],
 )
 def test_a_name_that_is_too_long_is_one_sentence(
