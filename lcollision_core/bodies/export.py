@@ -34,6 +34,7 @@ from lcollision_core.files import (
     write_mesh,
     written_frame,
 )
+from lcollision_core.files.character_writing import NewClip, write_character_clips
 from lcollision_core.files.mesh.obj import ObjDetail, rewrite_obj
 from lcollision_core.files.motion.caches import point_cache, read_frame
 from lcollision_core.files.table import (
@@ -41,7 +42,6 @@ from lcollision_core.files.table import (
     SCENE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
-from lcollision_core.files.written import NewClip, write_character_clips
 from lcollision_core.meshes import FaceGroup, RigidTransform, body_size
 from lcollision_core.meshes.face_groups import GROUP_KINDS
 from lcollision_core.meshes.normals import corner_normals

@@ -40,6 +40,7 @@ from lcollision_core.files.animated import frame_rate
 from lcollision_core.files.changed_clips import ChangedClip, changed_gltf, clip_vertices
 from lcollision_core.files.character import ClipFrames
 from lcollision_core.files.character_reading import character_of, character_of_smpl
+from lcollision_core.files.character_writing import require_written
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.motion.bvh import read_bvh
 from lcollision_core.files.motion.generated import is_generated
@@ -53,7 +54,6 @@ from lcollision_core.files.table import (
     SCENE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
-from lcollision_core.files.written import require_written
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.topology import FloatArray

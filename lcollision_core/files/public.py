@@ -11,6 +11,13 @@ from lcollision_core.files.character_reading import (
     without_user_choices,
     written_frame,
 )
+from lcollision_core.files.character_writing import (
+    CharacterForm,
+    PosedFile,
+    read_own_file,
+    write_character,
+    write_character_clip,
+)
 from lcollision_core.files.mesh_file import (
     Mesh,
     as_stored,
@@ -36,11 +43,4 @@ from lcollision_core.files.safe import (
     locked,
     require_writable,
     unused_name,
-)
-from lcollision_core.files.written import (
-    CharacterForm,
-    PosedFile,
-    read_own_file,
-    write_character,
-    write_character_clip,
 )

@@ -561,7 +561,7 @@ def require_motions(
     """Raise early if an output cannot hold the motions."""
     from lcollision_core.bodies.motions import character_of_motion, is_retargeted
     from lcollision_core.bodies.retargeting import require_skeleton
-    from lcollision_core.files.written import require_written
+    from lcollision_core.files.character_writing import require_written
 
     suffix = output.path.suffix.lower()
     if output.form == "frames":
