@@ -342,7 +342,7 @@ class CollisionPredictor:
         """Return a new torch network in single precision on the CPU, with fixed weights."""
         import torch
 
-        from lcollision_core.predictor.presets import NETWORKS
+        from lcollision_core.predictor.networks import NETWORKS
 
         state = {name: torch.tensor(array) for name, array in self.arrays.items()}
         network = NETWORKS[self.config.preset].restore(self.embedding, self.config, state)

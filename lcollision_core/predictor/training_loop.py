@@ -35,8 +35,8 @@ from lcollision_core.predictor.config import (
 from lcollision_core.predictor.geometric_network import FoldDetector
 from lcollision_core.predictor.metrics import error_rates
 from lcollision_core.predictor.network_base import PredictorNetwork, SkinCells, Targets
+from lcollision_core.predictor.networks import NETWORKS
 from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
-from lcollision_core.predictor.presets import NETWORKS
 
 
 @dataclass(frozen=True)
