@@ -206,7 +206,7 @@ class FileActions(QObject):
         LCollisionError : the extension is not supported, or the file does not exist.
         """
         from lcollision_core.files.motion.generated import is_generated
-        from lcollision_core.files.motion.smpl_motion import is_smpl_motion
+        from lcollision_core.files.motion.smpl import is_smpl_motion
         from lcollision_core.tasks.scenes import is_scene_file
 
         self._dropped = None
@@ -469,7 +469,7 @@ class FileActions(QObject):
         begun : whether writing has begun; False if the user cancelled
         """
         from lcollision_core.bodies import as_scene
-        from lcollision_core.files.motion.smpl_motion import is_smpl_motion
+        from lcollision_core.files.motion.smpl import is_smpl_motion
 
         document, timeline = self._document, self._document.timeline
         model, motion, file = document.model, timeline.motion, timeline.file
@@ -808,8 +808,7 @@ class FileActions(QObject):
 def is_learned_from(path: Path) -> bool:
     """Whether a model is learned from a path: a folder, or a file of poses of one body."""
     from lcollision_core.files.motion.generated import is_generated
-    from lcollision_core.files.motion.smpl_motion import is_smpl_motion
-    from lcollision_core.files.scene.smpl import is_smpl_model
+    from lcollision_core.files.motion.smpl import is_smpl_model, is_smpl_motion
 
     if is_smpl_model(path) or is_smpl_motion(path) or is_generated(path):
         return False

@@ -159,7 +159,7 @@ def _opened_in_shape(
 ) -> OpenedModel | None:
     """Return the body in the shape that the kept motion's file gives; None if it gives none."""
     from lcollision_core.bodies.motions import body_of_motion
-    from lcollision_core.files.motion.smpl_motion import is_smpl_motion
+    from lcollision_core.files.motion.smpl import is_smpl_motion
 
     file = stored.get("file") if isinstance(stored, dict) else None
     if not isinstance(file, str) or not is_smpl_motion(file):

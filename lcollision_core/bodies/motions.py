@@ -26,7 +26,6 @@ from lcollision_core.bodies.retargeting import (
 )
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
-from lcollision_core.bodies.smpl_skeleton import axes_of_smpl
 from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.files import (
     Character,
@@ -44,7 +43,12 @@ from lcollision_core.files.character_writing import require_written
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.motion.bvh import read_bvh
 from lcollision_core.files.motion.generated import is_generated
-from lcollision_core.files.motion.smpl_motion import SmplMotion, is_smpl_motion, read_smpl_motion
+from lcollision_core.files.motion.smpl import (
+    SmplMotion,
+    axes_of_smpl,
+    is_smpl_motion,
+    read_smpl_motion,
+)
 from lcollision_core.files.safe import atomic_write
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene_files import as_file_error, open_rigged, read_scene, scene_of
@@ -56,8 +60,8 @@ from lcollision_core.files.table import (
 )
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform, Topology
+from lcollision_core.meshes.extents import box_corners
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.meshes.units import box_corners
 from lcollision_core.motion import NOMINAL_RATE, GroundReport, Motion, is_worse, worse_spans
 from lcollision_core.motion.contacts import KeptContacts
 from lcollision_core.posing import ExactCheck, PoseSpace

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.files.names import make_unique
+from lcollision_core.files.safe import make_unique
 from lcollision_core.meshes.topology import FloatArray
 
 MAX_NAME_LENGTH = 60

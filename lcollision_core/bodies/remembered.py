@@ -30,8 +30,8 @@ from lcollision_core.files import (
     with_up_axis,
     without_user_choices,
 )
+from lcollision_core.files.motion.smpl import refuse_pickle
 from lcollision_core.files.safe import atomic_write, read_regular
-from lcollision_core.files.scene.smpl import refuse_pickle
 from lcollision_core.files.scene_files import SceneDocument, open_scene
 from lcollision_core.files.table import SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.json_values import from_json, parse_document

@@ -13,11 +13,12 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.body import Body
-from lcollision_core.bodies.fingers import N_SEGMENTS, finger_joints
 from lcollision_core.bodies.partners import (
     ALIGNED,
     LEAST_JOINTS,
+    N_SEGMENTS,
     JointMatch,
+    finger_joints,
     followed_limbs,
     match_by_name,
     match_of,
@@ -29,7 +30,6 @@ from lcollision_core.bodies.partners import (
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, limb_children, rig_of
-from lcollision_core.bodies.smpl_skeleton import skeleton_of_smpl
 from lcollision_core.bodies.standing_pose import (
     ReposedMotion,
     SkeletonMotion,
@@ -51,14 +51,14 @@ from lcollision_core.files.motion.node_motion import (
     nearest_axes,
     rotations_of,
 )
-from lcollision_core.files.motion.smpl_motion import is_smpl_motion, read_smpl_motion
+from lcollision_core.files.motion.smpl import is_smpl_motion, read_smpl_motion, skeleton_of_smpl
 from lcollision_core.files.motion.vrma import read_vrma, vrma_bytes
 from lcollision_core.files.safe import atomic_write
 from lcollision_core.files.scene_files import as_file_error, read_skeleton_scene
 from lcollision_core.files.table import BVH_SUFFIX, SKELETON_SUFFIXES, VRMA_SUFFIX
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.motion import Motion
+from lcollision_core.motion import NOMINAL_RATE, Motion
 
 _SHORT, _SHORT_BONE = 1e-9, 0.02
 """Length regarded as zero; and the share of the size below which a bone has no clear direction."""
@@ -739,7 +739,7 @@ def _read(
     if is_generated(path):
         return read_generated(path)
     if is_smpl_motion(path):
-        return [skeleton_of_smpl(read_smpl_motion(path))]
+        return [skeleton_of_smpl(read_smpl_motion(path), NOMINAL_RATE)]
     scene = read_skeleton_scene(path)
     with as_file_error(path):
         return motions_of_scene(scene, clip, fps, most)

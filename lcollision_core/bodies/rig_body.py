@@ -54,10 +54,10 @@ from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import fit_rigid, part_groups
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION, MAX_GROUP_NAME_LENGTH
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
+from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.meshes.units import body_size
 from lcollision_core.model_file import digest_of
 
 if TYPE_CHECKING:

@@ -15,17 +15,16 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies import rig_kernels
-from lcollision_core.bodies.pose_shapes import PoseShapes
+from lcollision_core.bodies.rig_kernels import PoseShapes
 from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, joint_limits, rig_of
 from lcollision_core.errors import ShapeError
 from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.scene.transforms import nearest_winding
-from lcollision_core.meshes.displacement import DisplacementMetrics
+from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.limbs import LEAST_LIMB, Limbs
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, length_graph
-from lcollision_core.meshes.units import body_size
-from lcollision_core.posing.pose_space import PosesOnGpu
+from lcollision_core.posing.pose_space import DisplacementMetrics, PosesOnGpu
 
 _Influences = tuple[IntArray, IntArray, FloatArray, FloatArray]
 

@@ -26,8 +26,8 @@ from lcollision_core.files.safe import atomic_write, read_regular
 from lcollision_core.files.table import READABLE_SUFFIXES, SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.json_values import from_json, parse_document, parse_json
 from lcollision_core.meshes import RigidTransform, Topology
+from lcollision_core.meshes.extents import guess_up
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.meshes.upright import guess_up
 
 SCENE_FORMAT, _VERSION = "lcollision-scene", 1
 _MAX_BYTES = 10_000_000

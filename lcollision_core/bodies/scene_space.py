@@ -15,10 +15,10 @@ from scipy.sparse import csr_matrix
 
 from lcollision_core.bodies.rig_space import ROOT_CODES
 from lcollision_core.meshes import RigidTransform, Topology
-from lcollision_core.meshes.displacement import DisplacementMetrics
 from lcollision_core.meshes.limbs import Limbs
 from lcollision_core.meshes.topology import FloatArray, length_graph
 from lcollision_core.posing import PoseSpace
+from lcollision_core.posing.pose_space import DisplacementMetrics
 
 _Indices = npt.NDArray[np.intp]
 

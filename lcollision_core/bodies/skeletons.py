@@ -13,10 +13,16 @@ import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.character import Character, Rig
-from lcollision_core.meshes.joint_kinds import JOINT_KINDS, Role, Side
-from lcollision_core.meshes.part_names import joint_labels, part_labels, part_names
+from lcollision_core.meshes.extents import front_direction
+from lcollision_core.meshes.joint_kinds import (
+    JOINT_KINDS,
+    Role,
+    Side,
+    joint_labels,
+    part_labels,
+    part_names,
+)
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.meshes.units import front_direction
 
 LEG = (Role.THIGH, Role.SHIN, Role.FOOT, Role.TOE)
 ARM = (Role.SHOULDER, Role.UPPER_ARM, Role.FOREARM, Role.HAND)

@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 from lcollision_core.bodies.skeletons import anatomy_of, joint_roles, limb_children, rig_of
 from lcollision_core.files.character import Character, ClipFrames, Rig
 from lcollision_core.files.motion.node_motion import least_turns
-from lcollision_core.meshes.joint_kinds import Role, Side
-from lcollision_core.meshes.part_names import part_names
+from lcollision_core.meshes.joint_kinds import Role, Side, part_names
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 _MOST_SAMPLES, _MOST_FIGURES = 64, 8

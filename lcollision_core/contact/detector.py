@@ -54,9 +54,9 @@ from lcollision_core.errors import ShapeError
 from lcollision_core.files.mesh_file import can_hold
 from lcollision_core.jobs import UNWATCHED, Job, available_cores, for_blocks
 from lcollision_core.meshes.contact_rules import N_RULES, STRICT, ContactRules, RuleCounts
+from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.topology import Topology
-from lcollision_core.meshes.units import body_size
 
 if TYPE_CHECKING:
     from lcollision_core.contact.gpu_search import GpuSearch

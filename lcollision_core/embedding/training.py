@@ -36,8 +36,8 @@ from lcollision_core.files.mesh_file import can_hold
 from lcollision_core.files.pose_set import PoseSet
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes.alignment import align_rigid
+from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.meshes.units import body_size
 
 _JACOBIAN_BYTES = 2_000_000_000
 """Bound on the memory of the Jacobians of poses that are fitted together."""

@@ -21,11 +21,11 @@ from lcollision_core.files.table import (
     SCENE_SUFFIXES,
 )
 from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.face_groups import FaceGroup
+from lcollision_core.meshes.joint_kinds import joint_labels, part_labels
 from lcollision_core.meshes.outliers import LARGEST_SIZE, is_torn, scale_of
-from lcollision_core.meshes.part_names import joint_labels, part_labels
 from lcollision_core.meshes.topology import FloatArray, Topology
-from lcollision_core.meshes.units import body_size
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,10 @@ from scipy.sparse import csc_matrix, csr_matrix
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.gltf.schema import PARTS, GltfDocument, as_float, local_transform
+from lcollision_core.files.motion.smpl import SmplModel
 from lcollision_core.files.scene.appearance import Appearance
 from lcollision_core.files.scene.joined import JoinedMesh, look_of
 from lcollision_core.files.scene.scene import MOST_KEYS_PER_SECOND, Part, Primitive, Scene
-from lcollision_core.files.scene.smpl import SmplModel
 from lcollision_core.files.scene.transforms import decompose, is_regular
 from lcollision_core.files.scene_files import as_file_error
 from lcollision_core.meshes.face_groups import FaceGroup

@@ -25,10 +25,10 @@ from lcollision_core.files.character import (
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.gltf.write import gltf_of
 from lcollision_core.files.mesh_file import turn_to_y
-from lcollision_core.files.names import make_unique
+from lcollision_core.files.motion.smpl import SmplModel, read_smpl
+from lcollision_core.files.safe import make_unique
 from lcollision_core.files.scene.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.files.scene.scene import Scene, ScenePoses, parents_first
-from lcollision_core.files.scene.smpl import SmplModel, read_smpl
 from lcollision_core.files.scene.transforms import is_regular
 from lcollision_core.files.scene_files import (
     SceneDocument,
@@ -39,9 +39,8 @@ from lcollision_core.files.scene_files import (
 )
 from lcollision_core.files.table import GLTF_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.meshes import RigidTransform
+from lcollision_core.meshes.extents import body_size, box_corners, guess_up
 from lcollision_core.meshes.topology import FloatArray, Topology
-from lcollision_core.meshes.units import body_size, box_corners
-from lcollision_core.meshes.upright import guess_up
 
 _NEAR, _NEARLY = 0.05, 1.5
 """Separate pieces, as of a robot, adjoin vertices within the first distance, normalised, and within

@@ -30,8 +30,7 @@ from lcollision_core.files.character_reading import character_of
 from lcollision_core.files.gltf.read import read_shown
 from lcollision_core.files.gltf.schema import PARTS, VERTEX_DATA, GltfDocument, stored_parts
 from lcollision_core.files.mesh.polygons import MAX_FILE_BYTES
-from lcollision_core.files.names import make_unique
-from lcollision_core.files.safe import atomic_write, read_regular
+from lcollision_core.files.safe import atomic_write, make_unique, read_regular
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene.scene import Primitive, ScenePoses, by_node, parents_first
 from lcollision_core.files.scene.transforms import compose, decompose, signs_on_one_side
@@ -39,9 +38,9 @@ from lcollision_core.files.scene_files import SceneDocument, as_file_error, scen
 from lcollision_core.files.table import GLTF_SUFFIXES
 from lcollision_core.json_values import quoted
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules
+from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.normals import unit
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.meshes.units import body_size
 
 _KEY, _VERSION = "lcollision", 1
 _LONGEST_NAME = 100

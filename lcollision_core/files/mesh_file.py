@@ -1,4 +1,4 @@
-"""Read and write mesh files (OBJ, PLY, OFF, STL and scenes) in unchanged vertex order."""
+"""Read and write mesh files (OBJ, PLY, OFF, STL and scenes) in vertex order; find defects."""
 
 from __future__ import annotations
 
@@ -14,7 +14,13 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError, ShapeError
 from lcollision_core.files.mesh.obj import ObjDetail
 from lcollision_core.files.mesh.obj import encode as encode_obj
-from lcollision_core.files.mesh.polygons import MAX_FACES, Polygons, triangulate, with_order_of
+from lcollision_core.files.mesh.polygons import (
+    MAX_FACES,
+    Polygons,
+    first_at_each_position,
+    triangulate,
+    with_order_of,
+)
 from lcollision_core.files.safe import atomic_write, open_regular
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene.scene import Scene
@@ -26,7 +32,7 @@ from lcollision_core.files.table import (
     WRITABLE_SUFFIXES,
     function_of,
 )
-from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.topology import FloatArray, Topology, degenerate_faces
 
 SINGLE_PRECISION = tuple(suffix for suffix, kind in FILES.items() if kind.is_single)
 """Formats that hold only float32; the others hold either precision."""
@@ -352,3 +358,72 @@ def turn_to_y(up: FloatArray) -> FloatArray:
     aside = np.cross(towards, y)
     turn: FloatArray = np.outer(y, towards) - np.outer(towards, y) + np.outer(aside, aside)
     return turn
+
+
+def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> tuple[str, ...]:
+    """Find the defects that make a collision check, or a deformation, unreliable.
+
+    Parameters
+    ----------
+    topology : the faces
+    vertices : (V, 3) array, one pose
+
+    Returns
+    -------
+    problems : a sentence for each kind of defect; having several components is no defect
+
+    Raises
+    ------
+    ShapeError : `vertices` does not fit `topology`.
+    """
+    points = np.asarray(vertices)
+    if points.shape != (topology.n_vertices, 3):
+        raise ShapeError.must_be("vertices", f"({topology.n_vertices}, 3)", points.shape)
+    first = first_at_each_position(points)
+    duplicates = np.flatnonzero(first != np.arange(len(first)))
+    open_edges, crowded_edges = topology.boundary_edges, topology.non_manifold_edges
+    defects: tuple[tuple[npt.NDArray[np.integer], str, str, str], ...] = (
+        (open_edges, "edge has", "edges have", "the mesh is open: {} one face"),
+        (
+            crowded_edges,
+            "edge has",
+            "edges have",
+            "the mesh is not manifold: {} more than two faces, the first between vertices {}",
+        ),
+        (
+            topology.pinched_vertices,
+            "vertex joins",
+            "vertices join",
+            "the mesh is not manifold: {} parts of the surface that share no edge there, the first "
+            "is vertex {}",
+        ),
+        (
+            topology.unused_vertices,
+            "vertex is",
+            "vertices are",
+            "{} in no face, the first is vertex {}",
+        ),
+        (
+            degenerate_faces(topology, points),
+            "face has",
+            "faces have",
+            "{} no area, the first is face {}",
+        ),
+        (
+            duplicates,
+            "vertex lies",
+            "vertices lie",
+            "{} exactly on an earlier vertex, the first is vertex {}",
+        ),
+    )
+    problems = [
+        sentence.format(
+            f"{len(defect)} {one if len(defect) == 1 else several}",
+            " and ".join(map(str, np.atleast_1d(defect[0]))),
+        )
+        for defect, one, several, sentence in defects
+        if len(defect)
+    ]
+    if not (topology.is_watertight or len(open_edges) or len(crowded_edges)):
+        problems.append("the mesh has neighbouring faces that are wound in opposite senses")
+    return tuple(problems)

@@ -19,6 +19,7 @@ from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError,
 from lcollision_core.files.animated import read_animated
 from lcollision_core.files.mesh_file import (
     KEEP_PRECISION,
+    audit_mesh,
     coarseness_of,
     first_not_finite,
     read_mesh,
@@ -33,7 +34,7 @@ from lcollision_core.meshes.contact_rules import (
     STRICT,
     ContactRules,
 )
-from lcollision_core.meshes.degenerate import degenerate_faces
+from lcollision_core.meshes.extents import UpGuess, body_size, guess_up
 from lcollision_core.meshes.face_groups import (
     MAX_GROUPS,
     FaceGroup,
@@ -42,9 +43,7 @@ from lcollision_core.meshes.face_groups import (
     runs_to_faces,
 )
 from lcollision_core.meshes.outliers import outlier_poses
-from lcollision_core.meshes.topology import FloatArray, Topology
-from lcollision_core.meshes.units import body_size
-from lcollision_core.meshes.upright import UpGuess, guess_up
+from lcollision_core.meshes.topology import FloatArray, Topology, degenerate_faces
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -864,3 +863,28 @@ def _squared_distances(poses: FloatArray, vertices: FloatArray) -> FloatArray:
     squares = (poses**2).sum(axis=(1, 2)) + (vertices**2).sum()
     distances: FloatArray = (squares - 2.0 * values.sum(axis=1)) / len(vertices)
     return distances
+
+
+def inspect_pose_set(
+    path: str | os.PathLike[str],
+    job: Job = UNWATCHED,
+) -> PoseSetInspection:
+    """Read the usable poses of a pose set and list every defect instead of raising the first.
+
+    Parameters
+    ----------
+    path : see `read_pose_set`
+    job : reports (poses done, all poses)
+
+    Returns
+    -------
+    the usable poses and the defects
+    """
+    defects: list[LCollisionError] = []
+    poses = collect_poses(Path(path), defects.append, job)
+    problems = [str(defect) for defect in defects]
+    if poses.pose_set is not None:
+        where = f"pose 0 ({poses.pose_set.names[0]})"
+        reference = audit_mesh(poses.pose_set.topology, poses.pose_set.vertices[0])
+        problems += [f"{where}: {problem}" for problem in reference]
+    return replace(poses, defects=tuple(defects), problems=tuple(problems))

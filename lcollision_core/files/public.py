@@ -1,6 +1,5 @@
 """The public names of `lcollision_core.files`, loaded on first use."""
 
-from lcollision_core.files.audit import audit_mesh, inspect_pose_set
 from lcollision_core.files.character import Character, ClipFrames, Rig
 from lcollision_core.files.character_reading import (
     GltfCharacter,
@@ -21,15 +20,16 @@ from lcollision_core.files.character_writing import (
 from lcollision_core.files.mesh_file import (
     Mesh,
     as_stored,
+    audit_mesh,
     can_hold,
     read_mesh,
     write_mesh,
 )
-from lcollision_core.files.names import file_stem, file_stems, has_known_suffix
 from lcollision_core.files.pose_set import (
     PoseSet,
     PoseSetInspection,
     concatenated,
+    inspect_pose_set,
     mesh_files,
     read_pose_set,
     thinned,
@@ -40,6 +40,9 @@ from lcollision_core.files.safe import (
     atomic_files,
     atomic_write,
     file_stamp,
+    file_stem,
+    file_stems,
+    has_known_suffix,
     locked,
     require_writable,
     unused_name,

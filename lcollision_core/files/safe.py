@@ -1,4 +1,4 @@
-"""Safe file access: regular files only, atomic writes, locks, and untrusted .npz archives."""
+"""Safe file access: valid names, regular files only, atomic writes, locks, untrusted .npz."""
 
 from __future__ import annotations
 
@@ -13,17 +13,21 @@ import shutil
 import stat
 import sys
 import time
+import unicodedata
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from mimetypes import MimeTypes
+from pathlib import Path, PurePath
 from typing import IO, Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import FileLockedError, MeshFileError
+from lcollision_core.files.table import FILES
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -172,7 +176,7 @@ def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
 
 _MAX_NAME_BYTES = 100
 """Most bytes of the target's name within a temporary name."""
-_MAX_STEM_BYTES = 200
+_MAX_NUMBERED_BYTES = 200
 """Most bytes of the stem of an unused name, to leave space for a number."""
 
 FileStamp = tuple[int, int, int, int]
@@ -308,7 +312,7 @@ def file_stamp(path: str | os.PathLike[str]) -> FileStamp | None:
 
 def unused_name(path: Path) -> Path:
     """Return an unused name beside `path`, such as "m 2.obj"."""
-    stem, number = shortened(path.stem, _MAX_STEM_BYTES), 2
+    stem, number = shortened(path.stem, _MAX_NUMBERED_BYTES), 2
     while (unused := path.with_name(f"{stem} {number}{path.suffix}")).exists():
         number += 1
     return unused
@@ -491,3 +495,79 @@ def write_npz(file: BinaryIO, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, np.asarray(array), allow_pickle=False)
+
+
+def make_unique(
+    names: Iterable[str],
+    key: Callable[[str], str] = str,
+    joined: Callable[[str, str], str] = str.__add__,
+) -> list[str]:
+    """Make names unique by key: append a number such as " 2" to later ones.
+
+    Parameters
+    ----------
+    names : any names
+    key : maps a name to the value that must be unique, such as the name in lower case
+    joined : appends an ending to a name, and may shorten the name for it
+    """
+    used_names: set[str] = set()
+    counts: Counter[str] = Counter()
+    result = []
+    for name in names:
+        candidate, base = name, key(name)
+        while (key_of_it := key(candidate)) in used_names:
+            counts[base] += 1
+            candidate = joined(name, f" {counts[base] + 1}")
+        used_names.add(key_of_it)
+        result.append(candidate)
+    return result
+
+
+MAX_STEM_BYTES = 130
+"""Most bytes of a name without its extension; file systems allow 143 to 255 in total."""
+
+_OF_OTHER_PROGRAMS = re.compile(
+    r"\.(3dm|3ds|3mf|7z|abc|blend|bz2|c4d|dae|docx?|dxf|gz|iges|igs|ini|jsonl|log|lwo|ma|max"
+    r"|mb|md|msh|npy|od[pst]|pickle|pkl|pptx|pt|pth|rar|skp|step|stp|toml|usd[acz]?"
+    r"|vrml|vtk|vtp|vtu|wrl|x3d|xlsx|xyz|xz|ya?ml|zip|zst|ztl)"
+)
+_MEDIA = MimeTypes()
+"""Extensions known to the standard library, independent of the machine's own lists."""
+
+_NOT_IN_NAMES = re.compile(r'[\x00-\x1f\x7f-\x9f\u2028\u2029<>:"/\\|?*]+')
+_RESERVED = re.compile(r"(CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9¹²³])\s*(\.|$)", re.I)
+"""Device names on Windows, with any extension."""
+
+
+def has_known_suffix(path: PurePath) -> bool:
+    """Whether a name ends in the extension of a known format, unlike ".9" in "walk_v0.9"."""
+    suffix = path.suffix.lower()
+    if suffix in FILES or suffix in _MEDIA.types_map[True]:
+        return True
+    return bool(_OF_OTHER_PROGRAMS.fullmatch(suffix))
+
+
+def file_stem(name: str) -> str:
+    """Make a name valid as a file name without extension on common file systems."""
+    stem = _cut(_NOT_IN_NAMES.sub("_", name), MAX_STEM_BYTES) or "pose"
+    return f"_{_cut(stem, MAX_STEM_BYTES - 1)}" if _RESERVED.match(stem) else stem
+
+
+def file_stems(names: Iterable[str]) -> list[str]:
+    """Return each name's `file_stem`, numbered if an earlier one is the same file: "a", "A 2".
+
+    Some file systems ignore case and the encoding of accents.
+    """
+    return make_unique(
+        map(file_stem, names),
+        _folded,
+        lambda stem, ending: _cut(stem, MAX_STEM_BYTES - len(ending)) + ending,
+    )
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def _cut(name: str, n_bytes: int) -> str:
+    return shortened(name.strip(" ."), n_bytes).strip(" .")

@@ -2,7 +2,7 @@
 
 from lcollision_core.meshes.alignment import Alignment, RigidTransform, align_rigid, fit_rigid
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules, RuleCounts
-from lcollision_core.meshes.degenerate import degenerate_faces
+from lcollision_core.meshes.extents import UpGuess, body_size, front_direction, guess_up, up_axis
 from lcollision_core.meshes.face_groups import (
     GROUP_KINDS,
     FaceGroup,
@@ -13,6 +13,4 @@ from lcollision_core.meshes.face_groups import (
     part_groups,
     with_named_groups,
 )
-from lcollision_core.meshes.topology import Topology
-from lcollision_core.meshes.units import body_size, front_direction, up_axis
-from lcollision_core.meshes.upright import UpGuess, guess_up
+from lcollision_core.meshes.topology import Topology, degenerate_faces

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes.units import body_size
+from lcollision_core.meshes.extents import body_size
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Set
+from collections.abc import Callable, Iterable, Sequence, Set
 from copy import copy
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, Protocol
 
@@ -12,9 +13,55 @@ import numpy.typing as npt
 from scipy.sparse import csgraph, csr_matrix
 
 from lcollision_core.embedding import Embedding
-from lcollision_core.meshes.displacement import DisplacementMetrics
 from lcollision_core.meshes.limbs import Limbs, far_apart
 from lcollision_core.meshes.topology import FloatArray, Topology, length_graph
+
+_STIFFENING = 1e-3
+"""Added to the diagonal, relative to its mean, so that codes that move no vertex have a cost."""
+
+
+@dataclass(frozen=True, eq=False)
+class DisplacementMetrics:
+    """The mean squared vertex displacement by a small change of D codes, part by part.
+
+    Attributes
+    ----------
+    size : D
+    codes : for each of K parts, the (n,) codes that move its vertices
+    blocks : for each part, an (n, n) float64 array J_k^T J_k / V, where J_k is the Jacobian of its
+        vertices by these codes; V counts the vertices of all parts
+    """
+
+    size: int
+    codes: Sequence[npt.NDArray[np.intp]]
+    blocks: Sequence[FloatArray]
+
+    def squared(self, moved: FloatArray) -> FloatArray:
+        """Return the (K,) contributions of the parts to the mean squared displacement."""
+        return np.array(
+            [
+                moved[codes] @ block @ moved[codes]
+                for codes, block in zip(self.codes, self.blocks, strict=True)
+            ]
+        )
+
+    def weighted(self, weights: FloatArray) -> FloatArray:
+        """Return the (D, D) sum of the parts' metrics with (K,) weights."""
+        total = np.zeros((self.size, self.size))
+        for weight, codes, block in zip(weights, self.codes, self.blocks, strict=True):
+            if len(codes) == self.size:
+                total += weight * block
+            else:
+                total[codes[:, None], codes] += weight * block
+        return total
+
+    @cached_property
+    def definite(self) -> FloatArray:
+        """The (D, D) sum of all metrics, made positive definite by a small diagonal term."""
+        total = self.weighted(np.ones(len(self.blocks)))
+        total[np.diag_indices_from(total)] += _STIFFENING * np.trace(total) / len(total)
+        return total
+
 
 MeanSlopes = Callable[[FloatArray, FloatArray], FloatArray]
 """Take (D,) codes and (n, V, 3) derivatives by vertices; return (3 m + n, D) derivatives by the

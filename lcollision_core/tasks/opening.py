@@ -84,7 +84,7 @@ def examine(path: Path, job: Job, beside: Body | None = None) -> FileContent:
     With a body `beside` which others may stand, a mesh with another number of vertices is a prop.
     """
     from lcollision_core.files import read_character, read_mesh
-    from lcollision_core.files.scene.smpl import is_smpl_model
+    from lcollision_core.files.motion.smpl import is_smpl_model
     from lcollision_core.files.scene_files import is_animation_alone, open_scene
 
     if is_smpl_model(path):

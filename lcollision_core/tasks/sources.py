@@ -19,9 +19,9 @@ from lcollision_core.contact import CollisionDetector, touching_patches
 from lcollision_core.contact.exclusions import near_pairs_estimate
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import PoseSet, concatenated, read_character, read_pose_set, thinned
+from lcollision_core.files.motion.smpl import is_smpl_model
 from lcollision_core.files.pose_set import disagreement
 from lcollision_core.files.scene.joined import join_parts
-from lcollision_core.files.scene.smpl import is_smpl_model
 from lcollision_core.files.scene_files import as_file_error, open_rigged, read_scene
 from lcollision_core.files.table import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job

@@ -21,7 +21,7 @@ from lcollision_core.files.gltf.schema import (
     require_int,
     stored_parts,
 )
-from lcollision_core.files.names import make_unique
+from lcollision_core.files.safe import make_unique
 from lcollision_core.files.scene.scene import Clip, Part, ScenePoses
 from lcollision_core.files.scene.transforms import (
     compose,

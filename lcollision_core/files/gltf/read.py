@@ -27,7 +27,7 @@ from lcollision_core.files.gltf.schema import (
     require_int,
 )
 from lcollision_core.files.mesh.polygons import MAX_FACES, require_plausible_count
-from lcollision_core.files.names import make_unique
+from lcollision_core.files.safe import make_unique
 from lcollision_core.files.scene.scene import (
     NO_MESH,
     NoMeshError,

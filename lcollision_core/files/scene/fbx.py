@@ -28,8 +28,7 @@ from lcollision_core.files.mesh.polygons import (
     require_plausible_count,
     triangulate,
 )
-from lcollision_core.files.names import make_unique
-from lcollision_core.files.safe import read_regular
+from lcollision_core.files.safe import make_unique, read_regular
 from lcollision_core.files.scene.appearance import Appearance, ImageReader, Material, Texture, Wrap
 from lcollision_core.files.scene.scene import (
     NO_MESH,

@@ -15,9 +15,8 @@ from lcollision_core.files.scene.scene import MAX_FRAME_NUMBERS, Part, Scene, Sc
 from lcollision_core.files.scene.transforms import blend_dual_quaternions
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.contact_rules import MAX_GROUP_NAME_LENGTH
-from lcollision_core.meshes.degenerate import degenerate_faces
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
-from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.topology import FloatArray, Topology, degenerate_faces
 
 IntArray = npt.NDArray[np.int64]
 

@@ -8,7 +8,7 @@ import pytest
 from lcollision_core.acap.codec import AcapCodec
 from lcollision_core.files import PoseSet
 from lcollision_core.meshes.alignment import align_rigid
-from lcollision_core.meshes.units import body_size
+from lcollision_core.meshes.extents import body_size
 from tests.core.acap.jumps import n_jumps
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.bodies.fingers import FINGERS, finger_joints
+from lcollision_core.bodies.partners import FINGERS, finger_joints
 from lcollision_core.meshes.joint_kinds import Role, Side
 
 _MMD = {"thumb": "親指", "index": "人指", "middle": "中指", "ring": "薬指", "little": "小指"}

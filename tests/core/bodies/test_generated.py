@@ -227,9 +227,8 @@ def test_vectors_of_humanml3d_are_the_joints_that_they_were_made_of(tmp_path: Pa
 
 
 def test_a_motion_of_smpl_moves_the_limbs_of_another_body(tmp_path: Path) -> None:
-    from lcollision_core.bodies.smpl_skeleton import skeleton_of_smpl
     from lcollision_core.bodies.standing_pose import in_world
-    from lcollision_core.files.motion.smpl_motion import read_smpl_motion
+    from lcollision_core.files.motion.smpl import read_smpl_motion, skeleton_of_smpl
 
     poses = np.random.default_rng(4).normal(0.0, 0.25, (N_FRAMES, 52 * 3))
     # AMASS is z up.
@@ -247,7 +246,7 @@ def test_a_motion_of_smpl_moves_the_limbs_of_another_body(tmp_path: Path) -> Non
     ours = list(body.space.rig.joint_names)
     shown = np.stack([body.space.transforms(row) for row in motion.codes])[..., :3, 3]
     shown = shown @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]).T
-    skeleton = skeleton_of_smpl(read_smpl_motion(path))
+    skeleton = skeleton_of_smpl(read_smpl_motion(path), 30.0)
     _, places = in_world(skeleton)
     for start, end, first, last in LIMBS:
         own = shown[:, ours.index(end)] - shown[:, ours.index(start)]

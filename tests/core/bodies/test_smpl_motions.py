@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import MotionChange, body_of_motion, read_motions, write_clips
 from lcollision_core.errors import MeshFileError
-from lcollision_core.files.scene.smpl import JOINT_NAMES
+from lcollision_core.files.motion.smpl import JOINT_NAMES
 from lcollision_core.meshes.contact_rules import ContactRules
 from lcollision_core.motion import Motion
 from tests.small_models import stored

@@ -15,7 +15,7 @@ import pytest
 
 from lcollision_core.errors import MeshFileError, MissingExtraError
 from lcollision_core.files import read_character, read_mesh, write_character
-from lcollision_core.files.gltf.meshopt import decode
+from lcollision_core.files.gltf.packed import decode
 from lcollision_core.files.gltf.schema import GltfDocument
 from tests.core.gltf_builder import GltfBuilder, arm, tube
 

@@ -13,7 +13,7 @@ from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import read_character
 from lcollision_core.files.character_reading import character_of_smpl
-from lcollision_core.files.scene.smpl import JOINT_NAMES, SmplModel, read_smpl
+from lcollision_core.files.motion.smpl import JOINT_NAMES, SmplModel, read_smpl
 from lcollision_core.meshes.joint_kinds import Role
 from tests.rigged_shapes import FloatArray
 from tests.smpl_files import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.meshes.part_names import joint_labels, part_labels, part_names
+from lcollision_core.meshes.joint_kinds import joint_labels, part_labels, part_names
 
 
 @pytest.mark.parametrize(
