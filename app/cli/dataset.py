@@ -206,12 +206,10 @@ def make(
     rules: RuleOptions,
 ) -> None:
     """Make a pose set of the built-in body, or of a character's animations and its rig."""
-    from lcollision_core.errors import MeshFileError
-    from lcollision_core.files import require_writable, write_pose_set
+    from lcollision_core.files import write_pose_set
+    from lcollision_core.tasks.exporting import require_output
 
-    if output.suffix.lower() != ".npz":
-        raise MeshFileError.unwritable(output, "a pose set is an .npz file", "rename it")
-    require_writable(output)
+    require_output(output, ".npz")
     kind = _BODIES.get(sources[0])
     if kind is not None:
         if len(sources) > 1:

@@ -51,12 +51,13 @@ def print_figure(
     Exits with 1 if the pose could not be resolved; the file is still written, with the colliding
     parts merged.
     """
-    from lcollision_core.tasks.exporting import refuse_to_replace, source_files
+    from lcollision_core.files.table import PRINT_SUFFIXES
+    from lcollision_core.tasks.exporting import refuse_to_replace, require_output, source_files
     from lcollision_core.tasks.inputs import read_input_poses
-    from lcollision_core.tasks.printing import print_pose, require_print
+    from lcollision_core.tasks.printing import print_pose
     from lcollision_core.tasks.scenes import open_scene
 
-    require_print(output)
+    require_output(output, *PRINT_SUFFIXES)
     model = open_scene(model_name, NO_SCENE).with_options(rules)
     refuse_to_replace([output], [pose, *source_files(model)])
     with cancellable_bar("Making a solid") as job:

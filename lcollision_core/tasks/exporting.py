@@ -74,15 +74,16 @@ def suffix_of(output: Output, model: Body, request: ExportRequest) -> str:
     return f".{request.mesh_format or ('glb' if is_like_glb else 'obj')}"
 
 
-def require_output(path: Path, suffix: str) -> Output:
-    """Raise early unless an output is one writable file of a format.
+def require_output(path: Path, *suffixes: str) -> Output:
+    """Raise early unless an output is one writable file with one of some extensions.
 
     Raises
     ------
     LCollisionError : another extension, or the file cannot be written.
     """
-    if path.suffix.lower() != suffix:
-        raise LCollisionError.unwritable(path, f"it must be a {suffix} file", "rename it")
+    if path.suffix.lower() not in suffixes:
+        kinds = " or ".join(suffixes)
+        raise LCollisionError.unwritable(path, f"it must be a {kinds} file", "rename it")
     require_writable(path)
     return Output(path, "poses", file_stamp(path))
 

@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files import require_writable
 from lcollision_core.files.safe import atomic_write
 from lcollision_core.files.table import FILES, PRINT_SUFFIXES, function_of
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import PrintOptions
+from lcollision_core.tasks.exporting import require_output
 from lcollision_core.tasks.verdicts import PrintedFigure
 from lcollision_core.tasks.words import printed_text
 
@@ -28,20 +28,6 @@ _STEPS = 100
 """Progress steps in all; the first half is Resolve's."""
 _THINNEST = 1.0
 """Percentile of the surface's wall thickness that is reported as the thinnest wall."""
-
-
-def require_print(path: Path) -> None:
-    """Raise early unless an output is a writable file for printing.
-
-    Raises
-    ------
-    LCollisionError : another extension, or the file cannot be written.
-    """
-    if path.suffix.lower() not in PRINT_SUFFIXES:
-        raise LCollisionError.unwritable(
-            path, f"it must be a {' or '.join(PRINT_SUFFIXES)} file", "rename it"
-        )
-    require_writable(path)
 
 
 def print_pose(
@@ -70,7 +56,7 @@ def print_pose(
     """
     from lcollision_core.contact import solids
 
-    require_print(path)
+    require_output(path, *PRINT_SUFFIXES)
     check = body.exact_check(pose.placement, own and own())
     before = check.find(check.exported(check.decode(pose.latent)[0]))
     latent = pose.latent

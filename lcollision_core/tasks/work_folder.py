@@ -40,41 +40,23 @@ class WorkFolder:
     ----------
     destination : as given
     path : the folder, which may not exist
+    name : of the future model
+    poses : the training poses, once gathered
+    embedding : the model with its latent space, without a predictor
+    labels : the store of labelled samples
+    log : the error log of the background process
     """
 
     def __init__(self, destination: Path) -> None:
-        self.destination = destination
+        self.destination, self.name = destination, destination.stem
         self.path = work_path(destination)
+        self.poses, self.embedding = self.path / "poses.npz", self.path / f"embedding{MODEL_SUFFIX}"
+        self.labels, self.log = self.path / "labels", self.path / "log.txt"
 
     @classmethod
     def at(cls, path: Path) -> WorkFolder:
         """Return the work folder at this path."""
         return cls(path.with_name(path.name.removesuffix(WORK_SUFFIX)))
-
-    @property
-    def name(self) -> str:
-        """Name of the future model."""
-        return self.destination.stem
-
-    @property
-    def poses(self) -> Path:
-        """The training poses, once gathered."""
-        return self.path / "poses.npz"
-
-    @property
-    def embedding(self) -> Path:
-        """The model with its latent space, without a predictor."""
-        return self.path / f"embedding{MODEL_SUFFIX}"
-
-    @property
-    def labels(self) -> Path:
-        """The store of labelled samples."""
-        return self.path / "labels"
-
-    @property
-    def log(self) -> Path:
-        """The error log of the background process."""
-        return self.path / "log.txt"
 
     def checkpoint(self, stage: Stage) -> Path:
         """Return the checkpoint of a stage's training."""
