@@ -14,12 +14,11 @@ from lcollision_core.contact.kernels import find_rules
 from lcollision_core.contact.reach import (
     Creases,
     Lists,
-    faces_after,
+    faces_near_touching,
     faces_within,
     lists_of,
     no_lists,
     surface_of,
-    touching_faces,
     vertices_after,
 )
 from lcollision_core.errors import ShapeError
@@ -169,8 +168,7 @@ def _about(
     if not len(pairs):
         return no_lists(0)
     require = partial(require_listable, rule=rule)
-    surface = surface_of(topology, reference)
-    return faces_after(touching_faces(surface, pairs, distance, require), require)
+    return faces_near_touching(surface_of(topology, reference), pairs, distance, require)
 
 
 def rules_of(

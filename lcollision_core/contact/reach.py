@@ -85,21 +85,6 @@ def lists_of(members: Sequence[npt.NDArray[np.integer]], n: int) -> Lists:
     return _table(np.concatenate(members), which, n, len(members))
 
 
-class TouchingFaces(NamedTuple):
-    """The T faces that touch others, and the faces near them.
-
-    Attributes
-    ----------
-    partners : T lists of the faces that each one touches, as indices into the T
-    around : T lists of the faces near each one
-    near_to : F lists of the touching faces near each face, as indices into the T
-    """
-
-    partners: Lists
-    around: Lists
-    near_to: Lists
-
-
 def surface_of(topology: Topology, reference: FloatArray) -> Surface:
     """Return a mesh in the form that the loops take, with edge lengths from (V, 3) vertices."""
     n_vertices, corners = topology.n_vertices, topology.faces
@@ -126,11 +111,19 @@ def faces_within(
     faces : (n,) int32; the list of a face includes the face itself
     require : called with the number of entries so far; may raise
     """
-    return _listed(
-        lambda first, last: _search_faces(surface, faces, first, last, distance),
-        len(faces),
-        require,
-    )
+    vertices, corners = np.unique(surface.corners[faces], return_inverse=True)
+    near = _reached(surface, vertices.astype(np.int32), distance, require)
+    n_faces, n_vertices = len(surface.corners), len(surface.face_start) - 1
+    of_corners = Lists(3 * np.arange(len(faces) + 1), corners.ravel().astype(np.int32))
+    at_corners = _matrix(of_corners, len(vertices))
+    at_vertices = _matrix(Lists(surface.face_start, surface.face), n_faces)
+    near_corners = _matrix(near, n_vertices)
+
+    def search(first: int, last: int) -> tuple[LongArray, IntArray]:
+        product = at_corners[first:last] @ near_corners @ at_vertices
+        return np.diff(product.indptr), product.indices
+
+    return _listed(search, len(faces), require)
 
 
 def vertices_after(
@@ -149,14 +142,8 @@ def vertices_after(
     require : see `faces_within`
     creases : limits of their distance in space; None for no limit
     """
-    n_vertices = len(surface.edge_start) - 1
-    none = np.zeros((0, 3))
-    bounds = creases or Creases(none, np.zeros(0), none, np.zeros(0))
-    return _listed(
-        lambda first, last: _search_vertices(surface, first, last, distance, bounds),
-        n_vertices,
-        require,
-    )
+    every = np.arange(len(surface.edge_start) - 1, dtype=np.int32)
+    return _reached(surface, every, distance, require, later=True, creases=creases)
 
 
 def with_pairs(lists: Lists, pairs: npt.NDArray[np.integer]) -> Lists:
@@ -167,20 +154,21 @@ def with_pairs(lists: Lists, pairs: npt.NDArray[np.integer]) -> Lists:
     return _table(rows, entries, n, n)
 
 
-def touching_faces(
+def faces_near_touching(
     surface: Surface,
     pairs: npt.NDArray[np.integer],
     distance: float,
     require: Callable[[int], None],
-) -> TouchingFaces:
-    """Find the faces within a distance of pairs of faces that touch.
+) -> Lists:
+    """List for each of F faces the later ones near a face that touches a face near it.
 
     Parameters
     ----------
-    pairs : (n, 2) face indices
+    pairs : (n, 2) indices of faces that touch
     distance : 0 for the faces alone
     require : see `faces_within`
     """
+    n_faces = len(surface.corners)
     faces, places = np.unique(pairs, return_inverse=True)
     a, b = places.reshape(-1, 2).T
     partners = _table(np.concatenate([a, b]), np.concatenate([b, a]), len(faces), len(faces))
@@ -189,23 +177,43 @@ def touching_faces(
     else:
         around = Lists(np.arange(len(faces) + 1), faces.astype(np.int32))
     owner = np.repeat(np.arange(len(faces)), np.diff(around.start))
-    near_to = _table(around.entry, owner, len(surface.corners), len(faces))
-    return TouchingFaces(partners, around, near_to)
+    near_to = _table(around.entry, owner, n_faces, len(faces))
+
+    def search(first: int, last: int) -> tuple[LongArray, IntArray]:
+        counts = np.empty(last - first, dtype=np.int64)
+        seen_for, listed_for = (np.full(n, -1, dtype=np.int32) for n in (len(faces), n_faces))
+        entries = _search_touching(near_to, partners, around, first, seen_for, listed_for, counts)
+        return counts, entries.copy()
+
+    return _listed(search, n_faces, require)
 
 
-def faces_after(touching: TouchingFaces, require: Callable[[int], None]) -> Lists:
-    """List for each of F faces the later ones near a face that touches a face near it.
+def _reached(
+    surface: Surface,
+    vertices: IntArray,
+    distance: float,
+    require: Callable[[int], None],
+    *,
+    later: bool = False,
+    creases: Creases | None = None,
+) -> Lists:
+    """List for each of n vertices those within a distance, or the later ones among them."""
+    none = np.zeros((0, 3))
+    bounds = creases or Creases(none, np.zeros(0), none, np.zeros(0))
+    n_vertices = len(surface.edge_start) - 1
 
-    Parameters
-    ----------
-    touching : the touching faces and the faces near them
-    require : see `faces_within`
-    """
-    return _listed(
-        lambda first, last: _search_touching(touching, first, last),
-        len(touching.near_to.start) - 1,
-        require,
-    )
+    def search(first: int, last: int) -> tuple[LongArray, IntArray]:
+        work = _Workspace(
+            np.full(n_vertices, np.inf),
+            np.empty(n_vertices, dtype=np.int32),
+            np.empty(n_vertices, dtype=np.int32),
+            np.zeros(n_vertices, dtype=np.bool_),
+        )
+        counts = np.empty(last - first, dtype=np.int64)
+        entries = _search(surface, vertices[first:last], distance, later, bounds, work, counts)
+        return counts, entries.copy()
+
+    return _listed(search, len(vertices), require)
 
 
 def _listed(
@@ -213,6 +221,7 @@ def _listed(
     n_lists: int,
     require: Callable[[int], None],
 ) -> Lists:
+    """Join the lengths and unsorted entries of the lists that a search makes block by block."""
     parts: dict[int, tuple[LongArray, IntArray]] = {}
 
     def work(first: int, last: int) -> None:
@@ -225,10 +234,14 @@ def _listed(
     counts, entries = zip(*(parts[first] for first in sorted(parts)), strict=True)
     start, entry = _starts(np.concatenate(counts)), np.concatenate(entries)
     # Sorted here, as Numba takes two seconds to compile a sort.
-    shape = n_lists, int(entry.max(initial=0)) + 1
-    table = sparse.csr_matrix((np.ones(len(entry), dtype=np.bool_), entry, start), shape)
+    table = _matrix(Lists(start, entry), int(entry.max(initial=0)) + 1)
     table.sort_indices()
     return Lists(start, table.indices.astype(np.int32))
+
+
+def _matrix(lists: Lists, n_columns: int) -> sparse.csr_matrix:
+    ones = np.ones(len(lists.entry), dtype=np.bool_)
+    return sparse.csr_matrix((ones, lists.entry, lists.start), (len(lists.start) - 1, n_columns))
 
 
 def _starts(counts: npt.NDArray[np.integer]) -> LongArray:
@@ -245,72 +258,105 @@ def _table(
     return Lists(table.indptr.astype(np.int64), table.indices.astype(np.int32))
 
 
-@compiled
-def _search_faces(
-    surface: Surface, faces: IntArray, first: int, last: int, distance: float
-) -> tuple[LongArray, IntArray]:
-    """Return the lengths and entries of the unsorted lists of ``faces[first:last]``."""
-    n_faces, n_vertices = len(surface.corners), len(surface.face_start) - 1
-    counts = np.zeros(last - first, dtype=np.int64)
-    entries, n_entries = np.empty(1024, dtype=np.int32), 0
-    away = np.full(n_vertices, np.inf)
-    reached = np.empty(n_vertices, dtype=np.int32)
-    waiting = np.empty(n_vertices, dtype=np.int32)
-    is_waiting = np.zeros(n_vertices, dtype=np.bool_)
-    listed_for = np.full(n_faces, -1, dtype=np.int32)
-    found_faces = np.empty(n_faces, dtype=np.int32)
-    for place in range(first, last):
-        corners = surface.corners[faces[place]]
-        n_found = 0
-        for k in range(_reach(surface, corners, distance, away, reached, waiting, is_waiting)):
-            vertex = reached[k]
-            away[vertex] = np.inf
-            for at in range(surface.face_start[vertex], surface.face_start[vertex + 1]):
-                other = surface.face[at]
-                if listed_for[other] != place:
-                    listed_for[other] = place
-                    found_faces[n_found] = other
-                    n_found += 1
-        entries = _with_found(entries, n_entries, found_faces, n_found)
-        n_entries += n_found
-        counts[place - first] = n_found
-    return counts, entries[:n_entries].copy()
+class _Workspace(NamedTuple):
+    """Arrays of one thread, (V,) each, the first infinite and the last false between searches.
+
+    NumPy allocates them, as Numba takes long to compile that.
+    """
+
+    away: FloatArray
+    reached: IntArray
+    waiting: IntArray
+    is_waiting: npt.NDArray[np.bool_]
 
 
 @compiled
-def _search_vertices(
+def _search(
     surface: Surface,
-    first: int,
-    last: int,
+    vertices: IntArray,
     distance: float,
+    later: bool,
     creases: Creases,
-) -> tuple[LongArray, IntArray]:
-    """Return the lengths and entries of the unsorted lists of vertices `first` to `last`."""
-    n_vertices = len(surface.face_start) - 1
-    counts = np.zeros(last - first, dtype=np.int64)
-    entries, n_entries = np.empty(1024, dtype=np.int32), 0
-    away = np.full(n_vertices, np.inf)
-    reached = np.empty(n_vertices, dtype=np.int32)
-    waiting = np.empty(n_vertices, dtype=np.int32)
-    is_waiting = np.zeros(n_vertices, dtype=np.bool_)
-    found_vertices = np.empty(n_vertices, dtype=np.int32)
-    start = np.empty(1, dtype=np.int32)
-    for vertex in range(first, last):
-        start[0] = vertex
-        n_found = 0
-        for k in range(_reach(surface, start, distance, away, reached, waiting, is_waiting)):
+    work: _Workspace,
+    counts: LongArray,
+) -> IntArray:
+    """Fill in the lengths of the lists of some vertices and return their unsorted entries."""
+    away, reached = work.away, work.reached
+    # With a plain 0, the search would be compiled twice.
+    n_entries = int(np.int64(0))
+    entries = np.empty(1024, dtype=np.int32)
+    for i in range(len(vertices)):
+        vertex, n_before = vertices[i], n_entries
+        n_reached = _reach(surface, vertex, distance, work)
+        entries = _with_space(entries, n_entries, n_reached)
+        for k in range(n_reached):
             other = reached[k]
             away[other] = np.inf
-            if other > vertex and (len(creases.length) == 0 or _may_fold(creases, vertex, other)):
-                found_vertices[n_found] = other
-                n_found += 1
-        entries = _with_found(entries, n_entries, found_vertices, n_found)
-        n_entries += n_found
-        counts[vertex - first] = n_found
-    return counts, entries[:n_entries].copy()
+            if later and other <= vertex:
+                continue
+            if len(creases.length) == 0 or _may_fold(creases, vertex, other):
+                entries[n_entries] = other
+                n_entries += 1
+        counts[i] = n_entries - n_before
+    return entries[:n_entries]
 
 
 @compiled
+def _search_touching(
+    near_to: Lists,
+    partners: Lists,
+    around: Lists,
+    first: int,
+    seen_for: IntArray,
+    listed_for: IntArray,
+    counts: LongArray,
+) -> IntArray:
+    """Fill in the lengths of the lists of faces from `first` on; return their unsorted entries.
+
+    Parameters
+    ----------
+    near_to : F lists of the T faces that touch others near each face, as indices into the T
+    partners : T lists of the faces that each one touches, as indices into the T
+    around : T lists of the faces near each one
+    seen_for, listed_for : (T,) and (F,), -1 before
+    """
+    # As in `_search`.
+    n_entries = int(np.int64(0))
+    entries = np.empty(1024, dtype=np.int32)
+    for face in range(first, first + len(counts)):
+        n_before = n_entries
+        for i in range(near_to.start[face], near_to.start[face + 1]):
+            near = near_to.entry[i]
+            for j in range(partners.start[near], partners.start[near + 1]):
+                partner = partners.entry[j]
+                if seen_for[partner] == face:
+                    continue
+                seen_for[partner] = face
+                begin, end = around.start[partner], around.start[partner + 1]
+                entries = _with_space(entries, n_entries, end - begin)
+                for k in range(begin, end):
+                    other = around.entry[k]
+                    if listed_for[other] != face and other > face:
+                        listed_for[other] = face
+                        entries[n_entries] = other
+                        n_entries += 1
+        counts[face - first] = n_entries - n_before
+    return entries[:n_entries]
+
+
+@compiled_part
+def _with_space(entries: IntArray, n_entries: int, n_more: int) -> IntArray:
+    """Return the array, or a larger copy if it has no space for so many more entries."""
+    if n_entries + n_more <= len(entries):
+        return entries
+    larger = np.empty(2 * (n_entries + n_more), dtype=np.int32)
+    # By element: for slices Numba compiles the message of a shape mismatch.
+    for k in range(n_entries):
+        larger[k] = entries[k]
+    return larger
+
+
+@compiled_part
 def _may_fold(creases: Creases, a: int, b: int) -> bool:
     """Whether two vertices are near enough at rest for skin to fold there."""
     places, joints = creases.places, creases.joints
@@ -329,75 +375,17 @@ def _may_fold(creases: Creases, a: int, b: int) -> bool:
     return False
 
 
-@compiled
-def _search_touching(touching: TouchingFaces, first: int, last: int) -> tuple[LongArray, IntArray]:
-    """Return the lengths and entries of the unsorted lists of faces `first` to `last`."""
-    partners, around, near_to = touching.partners, touching.around, touching.near_to
-    n_faces = len(near_to.start) - 1
-    counts = np.zeros(last - first, dtype=np.int64)
-    entries, n_entries = np.empty(1024, dtype=np.int32), 0
-    listed_for = np.full(n_faces, -1, dtype=np.int32)
-    seen_for = np.full(len(partners.start), -1, dtype=np.int32)
-    reached = np.empty(n_faces, dtype=np.int32)
-    for face in range(first, last):
-        n_found = 0
-        for i in range(near_to.start[face], near_to.start[face + 1]):
-            near = near_to.entry[i]
-            for j in range(partners.start[near], partners.start[near + 1]):
-                partner = partners.entry[j]
-                if seen_for[partner] == face:
-                    continue
-                seen_for[partner] = face
-                for k in range(around.start[partner], around.start[partner + 1]):
-                    other = around.entry[k]
-                    if listed_for[other] != face and other > face:
-                        listed_for[other] = face
-                        reached[n_found] = other
-                        n_found += 1
-        entries = _with_found(entries, n_entries, reached, n_found)
-        n_entries += n_found
-        counts[face - first] = n_found
-    return counts, entries[:n_entries].copy()
-
-
 @compiled_part
-def _with_found(entries: IntArray, n_entries: int, found: IntArray, n_found: int) -> IntArray:
-    """Append the found items to the first entries; the array grows if needed."""
-    needed = n_entries + n_found
-    if needed > len(entries):
-        larger = np.empty(max(2 * len(entries), needed), dtype=np.int32)
-        for k in range(n_entries):
-            larger[k] = entries[k]
-        entries = larger
-    for k in range(n_found):
-        entries[n_entries + k] = found[k]
-    return entries
-
-
-@compiled
-def _reach(
-    surface: Surface,
-    starts: IntArray,
-    distance: float,
-    away: FloatArray,
-    reached: IntArray,
-    waiting: IntArray,
-    is_waiting: npt.NDArray[np.bool_],
-) -> int:
-    """Fill `reached` with the vertices within a distance of the starts; return their number.
+def _reach(surface: Surface, start: int, distance: float, work: _Workspace) -> int:
+    """List the vertices within a distance of one in `work.reached`; return their number.
 
     Find shortest paths with a first-in, first-out queue: on a surface few vertices are improved
-    more than once, so a heap does not pay. `away` is infinite before and holds distances after.
+    more than once, so a heap does not pay. Afterwards `work.away` holds their distances.
     """
-    size, head, n_waiting, n_reached = len(waiting), 0, 0, 0
-    for vertex in starts:
-        if away[vertex] > 0.0:
-            away[vertex] = 0.0
-            reached[n_reached] = vertex
-            n_reached += 1
-            waiting[(head + n_waiting) % size] = vertex
-            is_waiting[vertex] = True
-            n_waiting += 1
+    away, reached, waiting, is_waiting = work
+    size, head, n_waiting, n_reached = len(waiting), 0, 1, 1
+    away[start] = 0.0
+    reached[0] = waiting[0] = start
     while n_waiting > 0:
         vertex = waiting[head]
         head = (head + 1) % size
