@@ -20,8 +20,8 @@ def as_task(work: Callable[..., Any], *arguments: Any) -> Task:
     return lambda _: work(*arguments)
 
 
-_PROGRESS_SECONDS = 0.05
-"""Least time between two progress reports: more would only keep the window busy."""
+_PROGRESS_SECONDS = 0.1
+"""Least time between two progress reports: each recomposes the whole window."""
 
 
 @dataclass(frozen=True, eq=False)
