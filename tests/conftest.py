@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,8 +26,14 @@ UNPUBLISHED = {"characters", "scape", "jumping"}
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests as slow: of unpublished data, and all but the first of `variants`."""
+    counts: Counter[str] = Counter()
     for item in items:
-        if UNPUBLISHED.intersection(getattr(item, "fixturenames", ())):
+        variants = item.get_closest_marker("variants")
+        name = item.nodeid.partition("[")[0]
+        counts[name] += 1
+        is_another = variants is not None and counts[name] > (*variants.args, 1)[0]
+        if is_another or UNPUBLISHED.intersection(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
 
 

@@ -65,8 +65,9 @@ def qtbot(request: pytest.FixtureRequest) -> QtBot:
 
 @pytest.fixture(autouse=True)
 def _plain_edges(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw without multisampling: in software it takes a third of the time of most tests."""
+    """Draw without multisampling, which takes long in software, and the final picture soon."""
     monkeypatch.setattr(canvas, "_SMOOTH_SAMPLES", 0)
+    monkeypatch.setattr(canvas, "_REST_MILLISECONDS", 60)
 
 
 @pytest.fixture(autouse=True)

@@ -302,6 +302,7 @@ def exported(lcollision: Lcollision, tmp_path: Path) -> Callable[..., Path]:
     return export
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("form", ["joints", "mesh", "morph", "clip"])
 def test_a_character_s_file_written_here_is_checked_by_its_rules_anywhere(
     lcollision: Lcollision,
@@ -329,6 +330,7 @@ def test_a_character_s_file_written_here_is_checked_by_its_rules_anywhere(
     assert report["rules"] == ContactRules().to_json()
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("name", ["posed.obj", "posed.ply", "hero.glb"])
 def test_a_mesh_of_a_character_that_was_opened_is_checked_by_its_rules(
     lcollision: Lcollision,
@@ -358,6 +360,7 @@ def _edited(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
     builder.write(path)
 
 
+@pytest.mark.variants(3)
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [

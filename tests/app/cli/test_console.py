@@ -87,6 +87,7 @@ def test_in_a_pipe_short_work_says_nothing() -> None:
         assert reader.read() == ""
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("name", ["label", "predictor"])
 def test_in_a_pipe_a_line_comes_every_half_minute(name: str) -> None:
     """The interval is reduced to 0 here."""

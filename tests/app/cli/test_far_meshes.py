@@ -47,6 +47,7 @@ def meshes_of(
     return made
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize(
     ("distance", "factor", "options"), [(1e6, 1.0, []), (1e8, 1000.0, ["--keep-detail"])]
 )

@@ -308,6 +308,7 @@ def test_poses_of_a_character_become_a_clip_of_its_file(
     assert np.abs(frames.vertices - model.decode(latents)).max() < 1e-5
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("form", ["joints", "mesh"])
 def test_resolve_frees_a_character_in_its_own_file(
     lcollision: Lcollision, tmp_path: Path, form: str

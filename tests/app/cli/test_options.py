@@ -84,6 +84,7 @@ def test_limits_hold_wherever_the_options_come_from(change: dict, sentence: str)
     assert str(caught.value) == sentence
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("name", ["sample", "resolve", "decode", "dataset make"])
 def test_what_searches_collisions_can_leave_groups_out(
     lcollision: Lcollision, tmp_path: Path, name: str

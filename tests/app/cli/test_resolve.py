@@ -521,6 +521,7 @@ def test_a_model_without_a_predictor_is_refused(
     assert "has no predictor" in result.stderr
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("name", ["results_v0.9", "o_1.05", "new.obj/", "a.v2"])
 def test_a_name_with_a_dot_that_is_no_format_is_a_folder(
     lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path, name: str

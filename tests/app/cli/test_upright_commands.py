@@ -47,6 +47,7 @@ def test_dataset_check_says_which_way_is_up(lcollision: Lcollision, tmp_path: Pa
     assert report["up_axis"] in "xyz"
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("up", ["x", "z"])
 def test_training_takes_the_axis_that_it_is_told(
     lcollision: Lcollision, tmp_path: Path, up: str

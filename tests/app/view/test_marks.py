@@ -26,6 +26,7 @@ def _places(viewport: Viewport, points: npt.NDArray[np.floating]) -> npt.NDArray
     return places_of(viewport.scene.view, points, (canvas.width(), canvas.height()))
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("shading", [Shading.PLAIN, Shading.DOMAINS])
 def test_the_patch_is_painted_where_it_is_and_nowhere_else(
     qtbot: QtBot, viewport: Viewport, shading: Shading

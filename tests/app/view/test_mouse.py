@@ -68,6 +68,7 @@ def test_each_camera_shows_the_whole_body(viewport: Viewport) -> None:
     assert len(positions) == len(CAMERAS)
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("closely", [False, True])
 def test_who_sees_the_whole_body_goes_on_seeing_it(
     qtbot: QtBot, document: PoseDocument, viewport: Viewport, closely: bool
@@ -115,6 +116,7 @@ def test_a_camera_is_turned_to_by_degrees_and_arrives(qtbot: QtBot, viewport: Vi
     np.testing.assert_allclose(directions[0], -directions[1], atol=1e-6)
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("steps", [[3.0, 3.0], [0.1] * 20, [-2.0], [2.0, -2.0]])
 def test_the_wheel_zooms_at_the_pointer(
     qtbot: QtBot, viewport: Viewport, steps: list[float]
@@ -310,6 +312,7 @@ def settled(qtbot: QtBot, viewport: Viewport) -> None:
     rest(qtbot, viewport)
 
 
+@pytest.mark.variants(3)
 @pytest.mark.parametrize(
     ("button", "keys", "on_body", "shifts"),
     [

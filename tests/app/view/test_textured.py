@@ -120,6 +120,7 @@ def test_a_pose_takes_its_texture_along(draw: Draw) -> None:
     assert front.at(-0.5, 0.5) == BEHIND
 
 
+@pytest.mark.variants(3)
 @pytest.mark.parametrize(
     ("wrap", "expected"),
     [

@@ -32,6 +32,7 @@ def video(qtbot: QtBot, window: MainWindow, path: Path, style: VideoStyle) -> Pa
     return written
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
 def test_a_video_goes_round_once_in_the_size_and_the_time_asked_for(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
@@ -93,6 +94,7 @@ def test_a_cancelled_png_sequence_leaves_nothing(
     assert set(tmp_path.iterdir()) == before
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("suffix", [".webp", ".png"])
 def test_a_transparent_video_shows_nothing_but_the_body(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
@@ -105,6 +107,7 @@ def test_a_transparent_video_shows_nothing_but_the_body(
     assert alpha.max() == 255
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("suffix", [".gif", ".webp", ".png"])
 def test_one_colour_stands_behind_where_it_is_asked_for(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
@@ -117,6 +120,7 @@ def test_one_colour_stands_behind_where_it_is_asked_for(
         assert np.abs(corner - [0x20, 0xA0, 0x40]).max() <= 6
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize(
     ("name", "style", "reason"),
     [
@@ -175,6 +179,7 @@ def pick(dialog: QDialog) -> None:
     dialog.accept()
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
 def test_a_video_is_made_as_the_form_says(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, theme: object

@@ -135,6 +135,7 @@ def test_after_many_frames_the_last_is_shown_and_few_are_drawn(
     assert viewport.canvas.n_painted - painted <= min(len(told) + 2, 201)
 
 
+@pytest.mark.variants(3)
 @pytest.mark.parametrize("shading", Shading)
 def test_a_highlight_outlines_its_domain_and_leaves_all_colours_as_they_are(
     qtbot: QtBot,
@@ -441,6 +442,7 @@ def test_a_turntable_that_is_cancelled_as_it_is_packed_leaves_no_file(
     assert not document.tasks.busy
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize(
     ("owner", "act", "error"),
     [

@@ -99,6 +99,7 @@ def test_the_menu_opens_again_after_it_is_closed(window: MainWindow) -> None:
         QApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("device_pixel_ratio", [1.0, 2.0])
 def test_each_camera_has_an_icon_of_its_own(window: MainWindow, device_pixel_ratio: float) -> None:
     drawn = []

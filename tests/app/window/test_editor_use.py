@@ -195,6 +195,7 @@ def share_of_height(window: MainWindow) -> float:
     return (max(places) - min(places)) / canvas.height()
 
 
+@pytest.mark.variants
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize("opens_a_mesh", [False, True], ids=["pose", "mesh"])
 def test_it_opens_with_the_camera_on_its_first_pose_and_then_steps_back_only(
@@ -387,6 +388,7 @@ def test_every_action_is_in_a_menu_and_has_a_shortcut_of_its_own(window: MainWin
     assert all(action.toolTip() and action.toolTip() != action.text() for action in named)
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize(
     ("key", "share"),
     [
@@ -410,6 +412,7 @@ def test_keys_move_a_focused_slider(
     assert np.array_equal(shown(window), decoded(window.document))
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("of_words", [False, True], ids=["number", "words"])
 def test_the_window_s_shortcuts_work_while_a_field_has_the_keyboard(
     window: MainWindow, of_words: bool

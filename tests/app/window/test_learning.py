@@ -379,6 +379,7 @@ def test_rates_that_no_sample_tells_are_unknown() -> None:
     assert figures["False negative rate"] == "unknown: no sample collided"
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=lambda theme: theme.name)
 def test_the_pages_fit_800_by_600(
     qtbot: QtBot,

@@ -331,6 +331,7 @@ def test_a_dropped_mesh_becomes_the_pose(qtbot: QtBot, window: MainWindow, tmp_p
     assert "of the body size" in window.statusBar().currentMessage()
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
@@ -368,6 +369,7 @@ def test_dropped_garbage_is_refused_with_one_sentence(
     assert np.array_equal(shown(window), decoded(window.document))
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl", ".glb"])
 def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
@@ -394,6 +396,7 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
     assert np.abs(back - on_screen).max() < 2e-3 * model.body_size
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize(
     ("action", "name", "sentence"),
     [

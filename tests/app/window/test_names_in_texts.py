@@ -133,6 +133,7 @@ def test_the_list_of_shortcuts_names_no_step(window: MainWindow) -> None:
     dialog.reject()
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("how", ["button", "cancel", "shortcut"])
 def test_the_keyboard_stays_where_resolve_was_asked_for(
     qtbot: QtBot, window: MainWindow, editor_model: LearnedBody, how: str

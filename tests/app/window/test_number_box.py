@@ -49,6 +49,7 @@ def test_a_number_outside_the_trained_range_is_kept_and_marked(window: MainWindo
     assert window.statusBar().currentMessage() == ""
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("text", ["9999", "-9999", "123456789"])
 def test_a_number_that_is_too_far_is_refused_in_a_sentence(window: MainWindow, text: str) -> None:
     document, row = window.document, window.sliders.row_of(1)
@@ -82,6 +83,7 @@ def test_the_seed_is_not_cut_to_another(window: MainWindow) -> None:
     assert "999999" in window.statusBar().currentMessage()
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("make", [screenshot_form, video_form, resolve_form])
 @pytest.mark.parametrize("how", ["enter", "click"])
 def test_a_form_refuses_a_number_visibly_and_stays(

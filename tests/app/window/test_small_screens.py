@@ -83,6 +83,7 @@ def test_everything_is_reached_at_800_by_600(qtbot: QtBot, small: MainWindow) ->
     close_window(small)
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("shading", [Shading.DOMAINS, Shading.PREDICTED, Shading.EXACT])
 def test_the_note_of_the_legend_is_read_whole(
     qtbot: QtBot, small: MainWindow, shading: Shading
@@ -140,6 +141,7 @@ def test_what_a_narrow_tool_bar_leaves_out_is_behind_its_arrow(
     close_window(small)
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("kind", ["resolve", "screenshot", "turntable", "shortcuts", "about", "no"])
 def test_dialogs_fit_800_by_600(
     small: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
@@ -296,6 +298,7 @@ def test_the_width_of_a_panel_is_the_users_and_remembered(
     again.deleteLater()
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("size", [(800, 600), (1360, 840)])
 def test_resolve_is_in_sight_beside_long_lists_and_notes(
     qtbot: QtBot,

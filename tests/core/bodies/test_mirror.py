@@ -336,6 +336,7 @@ def test_a_pose_that_was_changed_forgets_it(
     assert all(pose.mirror_of is None for pose in read_poses(path, body))
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize(
     "damage",
     [

@@ -169,6 +169,7 @@ def test_what_was_resolved_goes_back_into_the_file_and_all_else_stays(tmp_path: 
     assert out.read_bytes() == path.read_bytes()
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16-le", "utf-16-be", "cp1252", "shift-jis"])
 def test_a_file_of_any_encoding_and_line_ends_is_read_and_written_in_them(
     tmp_path: Path, encoding: str

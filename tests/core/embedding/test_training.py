@@ -194,6 +194,7 @@ class CancelAt:
             self.token.cancel()
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize(
     "report",
     # In level 2 of the model of all poses, and in the codes of the one with held-out poses.

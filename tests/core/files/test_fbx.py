@@ -22,6 +22,7 @@ from tests.core.gltf_builder import tube
 pytest.importorskip("ufbx")
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("skinning", ["Linear", "Rigid", "DualQuaternion", "Blend"])
 def test_frames_agree_with_ufbx(tmp_path: Path, skinning: str) -> None:
     path = arm_fbx(tmp_path / "arm.fbx", skinning=skinning)
@@ -61,6 +62,7 @@ def test_a_clip_without_a_span_is_as_long_as_its_curves(tmp_path: Path) -> None:
     assert np.array_equal(frames[0].vertices, frames[1].vertices)
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize(("mode", "rate"), [(9, 30), (13, 24), (17, 30), (18, 30)])
 def test_clips_of_ntsc_rates_keep_their_last_frame(tmp_path: Path, mode: int, rate: int) -> None:
     path = arm_fbx(tmp_path / "arm.fbx")
@@ -75,6 +77,7 @@ def test_clips_of_ntsc_rates_keep_their_last_frame(tmp_path: Path, mode: int, ra
     assert times[-1] == pytest.approx(1.001, abs=1e-9)
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("rate", [23.98, 27.5, 59.94005714])
 def test_frames_are_those_of_the_clip_where_a_rate_is_rounded(tmp_path: Path, rate: float) -> None:
     path = arm_fbx(tmp_path / "arm.fbx")

@@ -25,6 +25,7 @@ from tests.core.labelled import as_bytes, files_of
 from tests.core.labels.conftest import N_ROWS, SEED
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("workers", [1, 2, 5])
 def test_any_number_of_workers_gives_the_same_files(
     workers: int, labeller: Labeller, ground_truth: LabelRows, finished: Path, tmp_path: Path

@@ -125,6 +125,7 @@ def test_anyone_can_read_it_with_numpy(finished: Path, ground_truth: LabelRows) 
     assert manifest["labels"]["seed"] == SEED
 
 
+@pytest.mark.variants(3)
 @pytest.mark.parametrize(
     "damage",
     [

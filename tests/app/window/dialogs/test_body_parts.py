@@ -252,6 +252,7 @@ def test_the_menu_of_a_slider(window: MainWindow) -> None:
     menu.close()
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("where", ["header", "row"])
 def test_the_menu_of_a_body_part(qtbot: QtBot, window: MainWindow, where: str) -> None:
     document, codes = window.document, window.document.model.latent_space.groups[2].codes

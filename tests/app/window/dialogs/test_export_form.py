@@ -65,6 +65,7 @@ def test_the_scale_follows_the_axes_and_both_are_remembered(
     assert scale.value() == pytest.approx(2.54)
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
 def test_an_export_is_written_as_the_form_says(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, theme: object
@@ -103,6 +104,7 @@ def arm_model(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> RigBody:
     return window.document.model
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("form", ["joints", "mesh", "morph"])
 def test_a_character_is_given_back_in_the_form_that_is_chosen(
     qtbot: QtBot, window: MainWindow, arm_model: RigBody, tmp_path: Path, form: str
@@ -156,6 +158,7 @@ def test_a_model_keeps_the_form_of_a_file_that_is_named(
     assert (tmp_path / "out.obj").read_text().startswith("# mine\n")
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])
 def test_a_model_keeps_the_form_of_the_file_that_it_was_learned_from(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
@@ -246,6 +249,7 @@ def test_selected_poses_are_the_frames_of_a_point_cache(
     assert window.settings["export_rate"] == 25
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("words", ["Replace", "Cancel"])
 def test_files_of_a_motion_that_nobody_has_named_are_asked_about(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, words: str
@@ -372,6 +376,7 @@ def test_a_character_whose_format_is_not_written_comes_back_as_glb_and_that_is_s
     assert said not in motion._about.text()
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
 def test_a_pose_is_printed_as_the_form_says(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, theme: object

@@ -69,6 +69,7 @@ SHOWN: dict[str, Callable[[MainWindow], QDialog]] = {
 }
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("kind", SHOWN)
 def test_each_button_and_field_of_a_dialog_has_a_letter(window: MainWindow, kind: str) -> None:
     dialog = SHOWN[kind](window)
@@ -78,6 +79,7 @@ def test_each_button_and_field_of_a_dialog_has_a_letter(window: MainWindow, kind
     dialog.deleteLater()
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("kind", ["shortcuts", "about", "contacts", "parts", "resolve_options"])
 def test_dialogs_of_the_menus_too(qtbot: QtBot, window: MainWindow, kind: str) -> None:
     if kind == "contacts":

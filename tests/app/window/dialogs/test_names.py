@@ -155,6 +155,7 @@ def test_a_dot_in_a_name_ends_no_format(qtbot: QtBot, window: MainWindow, tmp_pa
     qtbot.waitUntil((tmp_path / "walk v0.9.obj").is_file, timeout=PATIENCE)
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("suffix", [".json", ".obj", ".png"])
 def test_the_window_tells_of_a_name_that_is_too_long(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str

@@ -95,6 +95,7 @@ def ink(label: QLabel) -> str:
     return label.palette().color(label.foregroundRole()).name()
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("collides", [False, True], ids=["free", "colliding"])
 @pytest.mark.parametrize("right", [False, True], ids=["wrong", "right"])
 def test_the_estimate_steps_back_once_the_check_has_spoken(

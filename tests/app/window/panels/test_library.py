@@ -157,6 +157,7 @@ def press(window: QWidget, key: Qt.Key, modifiers: Qt.KeyboardModifier, *acts: o
         main.document.tasks.wait_for_saves()
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_story_save_changes_no_kept_pose(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path, theme: str
@@ -313,6 +314,7 @@ def test_a_tall_window_begins_with_two_rows(
     close_window(window)
 
 
+@pytest.mark.variants(2)
 @pytest.mark.parametrize(
     ("name", "n_lines"),
     [
@@ -529,6 +531,7 @@ def test_save_asks_before_it_replaces_what_another_program_wrote_meanwhile(
     rest(qtbot, window)
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("is_good", [True, False])
 def test_of_several_files_what_was_opened_is_told_once_it_is(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, is_good: bool

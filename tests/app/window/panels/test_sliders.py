@@ -397,6 +397,7 @@ def test_a_blend_tells_its_share_and_leaves_locked_parts_alone(
     assert np.array_equal(document.history.latent, np.where(held, start, target))
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("solid", [False, True])
 def test_a_double_click_far_from_the_handle_resets_in_one_step(
     qtbot: QtBot, window: MainWindow, solid: bool
@@ -422,6 +423,7 @@ def test_a_double_click_far_from_the_handle_resets_in_one_step(
     rest(qtbot, window)
 
 
+@pytest.mark.variants
 @pytest.mark.parametrize("of_library", [False, True], ids=["code", "blend"])
 def test_escape_ends_the_drag_of_a_slider_and_no_work(
     qtbot: QtBot, window: MainWindow, of_library: bool
