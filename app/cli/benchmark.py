@@ -33,6 +33,7 @@ ModelOption = Annotated[str, typer.Option("--model", metavar="M", help="A model 
 BodyOption = Annotated[
     str, typer.Option("--model", metavar="M|FILE", help="A model, or a rigged character.")
 ]
+BatchOption = Annotated[int, typer.Option("-n", min=1, metavar="N", help="Poses of a batch.")]
 
 _MISSING = "is not installed, so it is skipped; pip install 'lcollision[bench]' installs it"
 _PREDICTOR_IN_PAPER = (
@@ -225,7 +226,7 @@ def cores(
         Path | None,
         typer.Option(metavar="FILE", readable=False, help="The motion that is screened."),
     ] = None,
-    n_poses: Annotated[int, typer.Option("-n", min=1, metavar="N", help="Poses of a batch.")] = 256,
+    n_poses: BatchOption = 256,
     workers: ThreadsOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -249,9 +250,7 @@ def gpu(
             metavar="PATH", readable=False, help="Check the poses of this set, and blends, instead."
         ),
     ] = None,
-    n_poses: Annotated[
-        int, typer.Option("-n", min=1, metavar="N", help="Poses of a batch.")
-    ] = 10_000,
+    n_poses: BatchOption = 10_000,
     as_json: JsonOption = False,
 ) -> None:
     """Compare exact checks on GPU and CPU: results and speed."""

@@ -120,6 +120,15 @@ NoRulesOption = Annotated[
 PosesOutput = Annotated[
     Path, typer.Option("--output", "-o", metavar="POSES", help="The .json file to write.")
 ]
+ModelOutput = Annotated[
+    str,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="M",
+        help="The .safetensors file to write; a name alone stores it with your models.",
+    ),
+]
 FormOutput = Annotated[
     str,
     typer.Option(

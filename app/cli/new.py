@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from app.cli.console import JsonOption, cancel_on_interrupt, note, print_json, status_bar, tell
 from app.cli.contacts import note_rules
 from app.cli.evaluate import kind_lines
-from app.cli.inputs import DeviceOption
+from app.cli.inputs import DeviceOption, ModelOutput
 from app.cli.options import takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LCollisionError
@@ -27,15 +25,7 @@ if TYPE_CHECKING:
 @takes_options
 def new(
     request: LearningRequest,
-    output: Annotated[
-        str,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="NAME",
-            help="A name, to store the model with yours, or a .safetensors file.",
-        ),
-    ],
+    output: ModelOutput,
     device: DeviceOption = Device.AUTO,
     as_json: JsonOption = False,
 ) -> None:

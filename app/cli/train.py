@@ -13,7 +13,14 @@ import typer
 
 from app.cli.console import cancel_on_interrupt, note, progress_bar, status_bar
 from app.cli.evaluate import StoreArgument, kind_lines, open_store
-from app.cli.inputs import Axis, ModelArgument, PoseSetArgument, RowsOption, up_sentence
+from app.cli.inputs import (
+    Axis,
+    ModelArgument,
+    ModelOutput,
+    PoseSetArgument,
+    RowsOption,
+    up_sentence,
+)
 from app.cli.models import describe, error_sentence, measured_model_sentence, note_if_beside
 from app.cli.options import takes_options
 from lcollision_core.errors import CancelledError
@@ -28,22 +35,12 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Learn a model from data.", no_args_is_help=True)
 
-OutputOption = Annotated[
-    str,
-    typer.Option(
-        "--output",
-        "-o",
-        metavar="M",
-        help="The .safetensors file to write; a name alone stores it with your models.",
-    ),
-]
-
 
 @app.command("embedding")
 @takes_options
 def embedding(
     dataset: PoseSetArgument,
-    output: OutputOption,
+    output: ModelOutput,
     n_domains: Annotated[
         int, typer.Option("--domains", min=1, max=64, metavar="K", help="Number of domains.")
     ] = 10,
@@ -132,7 +129,7 @@ def embedding(
 def predictor(
     model_name: ModelArgument,
     store_path: StoreArgument,
-    output: OutputOption,
+    output: ModelOutput,
     preset: Annotated[
         Literal["default", "large", "paper"],
         typer.Option(
