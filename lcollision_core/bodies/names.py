@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.bundled import bundled_table
 from lcollision_core.files.safe import make_unique
 from lcollision_core.meshes.topology import FloatArray
 
@@ -149,22 +150,8 @@ _OWN = 0.25
 """Share of the largest domain's motion from which a code is named after its own domain."""
 _TINY = 1e-12
 
-_REGIONS = (
-    (r"\b(thumb|index|middle|ring|pinky|pinkie|little)\b", "finger"),
-    (r"\bfinger", "hand"),
-    (r"\btoes?\b", "foot"),
-    (r"clavicle|collar|scapula", "shoulder"),
-    (r"shoulder|forearm|\bhand|wrist", "arm"),
-    (r"forearm", "elbow"),
-    (r"\bhand", "wrist"),
-    (r"thigh|shin|calf|knee|\bfoot|\bfeet|ankle", "leg"),
-    (r"thigh", "hip"),
-    (r"shin|calf", "knee"),
-    (r"\bfoot|\bfeet", "ankle"),
-    (r"spine|torso|chest|belly|abdomen|waist|neck", "spine trunk"),
-    (r"\b(face|eyes?|jaw|chin|brow|tongue)\b", "head"),
-)
-"""Search words for body regions; each may add the next."""
+_TABLES = bundled_table("body_parts.toml", dict[str, Any])
+_REGIONS, PALETTE = _TABLES["regions"], _TABLES["palette"]
 
 _WAYS = (("up", "down"), ("forward", "back"), ("left", "right"))
 _ASIDE = 2
@@ -341,28 +328,6 @@ def way_in_words(along: FloatArray, side: float) -> str:
         return "out" if along[way] * side > 0.0 else "in"
     return _WAYS[way][int(along[way] < 0.0)]
 
-
-PALETTE = (
-    "#0077bb",
-    "#e69f00",
-    "#882255",
-    "#66ccee",
-    "#ee6677",
-    "#228833",
-    "#ddcc77",
-    "#332288",
-    "#cc79a7",
-    "#cc3311",
-    "#762a83",
-    "#999933",
-    "#009e73",
-    "#a6d854",
-    "#aa4499",
-    "#56b4e9",
-)
-"""From the palettes of Okabe and Ito 2008, Tol 2021 and ColorBrewer, ordered greedily to be
-furthest in CIELAB from earlier ones, in the worst case of normal, red-, green- and blue-blind
-vision (Machado et al. 2009)."""
 
 _MOST_ARRANGED = 3 * len(PALETTE)
 """Most domains whose colours are rearranged; with more, neighbours share a colour anyway."""

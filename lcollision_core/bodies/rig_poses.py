@@ -19,7 +19,7 @@ from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
 from lcollision_core.bodies.skeletons import limb_children
 from lcollision_core.bundled import bundled_table
 from lcollision_core.errors import LCollisionError
-from lcollision_core.meshes.joint_kinds import Role, Side
+from lcollision_core.meshes.joint_kinds import JOINT_KINDS, Role, Side
 from lcollision_core.meshes.topology import FloatArray
 
 _FINGERS = {Role.FINGER, Role.THUMB, Role.PALM}
@@ -414,32 +414,6 @@ def _frame(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.stack([first, second, np.cross(first, second)], axis=1)
 
 
-_Range = tuple[float, float]
-
-HUMAN: dict[Role, tuple[_Range, _Range, _Range]] = {
-    Role.TWIST: ((0, 0), (0, 0), (0, 0)),
-    Role.PALM: ((0, 5), (0, 0), (0, 0)),
-    Role.THUMB: ((-10, 35), (0, 0), (-10, 10)),
-    Role.FINGER: ((-5, 75), (0, 0), (-8, 8)),
-    Role.TOE: ((-20, 30), (0, 0), (0, 0)),
-    Role.FOOT: ((-25, 25), (-10, 10), (-15, 15)),
-    Role.HAND: ((-35, 35), (-20, 20), (-35, 35)),
-    Role.FOREARM: ((0, 135), (-60, 60), (0, 0)),
-    Role.SHOULDER: ((-10, 15), (0, 0), (-8, 15)),
-    Role.UPPER_ARM: ((-25, 100), (-40, 40), (-80, 70)),
-    Role.THIGH: ((-25, 100), (-25, 25), (-15, 45)),
-    Role.SHIN: ((0, 130), (0, 0), (0, 0)),
-    Role.NECK: ((-20, 25), (-30, 30), (-20, 20)),
-    Role.HEAD: ((-20, 25), (-35, 35), (-15, 15)),
-    Role.SPINE: ((-20, 60), (-40, 40), (-30, 30)),
-    Role.OTHER: ((-30, 30), (-30, 30), (-30, 30)),
-    Role.FACE: ((0, 0), (0, 0), (0, 0)),
-}
-"""Comfortable human ranges in degrees of bend, twist and sideways turn; drags allow more. Sideways
-is away from the middle and up. An upper arm's is measured from the horizontal, as rest poses
-differ. A chain of joints of the spine or the neck shares one range. Faces stay still, as their
-joints' names do not tell their motions."""
-
 _SHARED = {Role.SPINE, Role.NECK}
 _STILL = {Role.TWIST, Role.FACE}
 
@@ -528,7 +502,7 @@ class HumanDraws:
         They lie within the limits of drags, and are 0 where a joint has no code.
         """
         space = self.space
-        limits = np.radians(np.array([HUMAN[role] for role in space.roles], dtype=np.float64))
+        limits = np.radians([JOINT_KINDS[role].comfortable for role in space.roles])
         left = np.cross(space.up, space.front)
         middle = float(np.median(space.origins[self._turning] @ left))
         lengths = np.bincount(self._chain[self._turning], minlength=space.n_joints)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -57,6 +57,7 @@ class JointKind:
     words : pattern of its names, English ones and those of MMD, in lower case letters and digits
     limits : degrees of bend, twist and sideways turn from the rest pose. They are wider than a
         person's, as rest poses differ; a hinge hardly bends backwards.
+    comfortable : the same for random poses, see ``resources/joints.toml``
     part : the body part that it moves; None for that of its parent
     part_words : pattern of the names, without blanks, of all joints of the part, even if they are
         of another kind
@@ -66,6 +67,7 @@ class JointKind:
     label: str
     words: str
     limits: _Limits
+    comfortable: _Limits
     part: str | None = None
     part_words: str = "$^"
     is_paired: bool = True
@@ -78,22 +80,12 @@ JOINT_KINDS = {
 """In the order in which users are offered them: that of ``resources/joints.toml``."""
 
 
-_SIDES = {
-    **dict.fromkeys(("left", "lft", "lt", "lf", "l"), "Left"),
-    **dict.fromkeys(("right", "rgt", "rt", "rf", "r"), "Right"),
-}
-_PREFIXES = frozenset(
-    ("mixamorig", "bip", "bip01", "bip001", "biped", "valvebiped", "bind", "cc", "base", "def")
-    + ("org", "mch", "jnt", "joint", "jt", "skel", "rig", "c", "b", "j", "sec", "adj", "end")
-    + ("bone", "node")
+_WORDS = bundled_table("body_parts.toml", dict[str, Any])
+_PREFIXES, _FACE = frozenset(_WORDS["prefixes"]), frozenset(_WORDS["face"])
+_SIDES, _ENDS = (
+    {word: name for name, words in _WORDS[kind].items() for word in words}
+    for kind in ("sides", "ends")
 )
-"""Words that say nothing about the body part."""
-
-_FACE = frozenset(
-    ("eye", "eyes", "eyeball", "eyelid", "eyebrow", "brow", "ear", "earring", "lip", "lips", "jaw")
-    + ("chin", "hair", "nose", "face", "cheek", "tongue", "teeth")
-)
-"""Words of the head that match whole words only, as they are too short to search inside others."""
 
 _PAIRED = (
     Role.FOOT,
@@ -111,12 +103,6 @@ _PAIRED_WORDS = {"arm": ("upper arm", "forearm"), "leg": ("shin", "thigh")}
 
 _MOST_PARTS = 48
 """Most body parts that a list and colours can show; some rigs have hundreds of unknown joints."""
-
-_ENDS = {
-    **dict.fromkeys(("front", "fore"), "front"),
-    **dict.fromkeys(("hind", "rear", "back"), "hind"),
-}
-"""Words for the front and hind legs of a four-legged animal."""
 
 _SINGLE = (
     (JOINT_KINDS[Role.HEAD].part_words, "Head"),

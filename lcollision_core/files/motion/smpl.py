@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.spatial.transform import Rotation
 
+from lcollision_core.bundled import bundled_table
 from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.files.motion.node_motion import NodeMotion
 from lcollision_core.files.safe import ZIP_DAMAGE, read_npz
@@ -603,45 +604,13 @@ def _rate(arrays: Mapping[str, npt.NDArray[Any]]) -> float | None:
 _FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rotation from z-up coordinates, as in AMASS, to those of the body models."""
 
-_WAYS: dict[str, tuple[str, tuple[float, float, float]]] = {
-    "pelvis": ("", (0.0, -0.23, 0.03)),
-    "spine1": ("pelvis", (0.0, 0.12, -0.04)),
-    "spine2": ("spine1", (0.0, 0.14, 0.03)),
-    "spine3": ("spine2", (0.0, 0.05, 0.0)),
-    "neck": ("spine3", (0.0, 0.21, -0.03)),
-    "head": ("neck", (0.0, 0.09, 0.05)),
-    "jaw": ("head", (0.0, 0.0, 0.02)),
-    "left_eye": ("head", (0.03, 0.06, 0.06)),
-    "left_hip": ("pelvis", (0.06, -0.09, -0.01)),
-    "left_knee": ("left_hip", (0.04, -0.38, 0.0)),
-    "left_ankle": ("left_knee", (-0.01, -0.42, -0.04)),
-    "left_foot": ("left_ankle", (0.04, -0.06, 0.12)),
-    "left_collar": ("spine3", (0.07, 0.11, -0.02)),
-    "left_shoulder": ("left_collar", (0.12, 0.05, -0.02)),
-    "left_elbow": ("left_shoulder", (0.26, -0.02, -0.02)),
-    "left_wrist": ("left_elbow", (0.26, 0.01, -0.01)),
-    "left_hand": ("left_wrist", (0.09, -0.01, -0.02)),
+_LEFT = bundled_table("smpl_skeleton.toml", dict[str, tuple[str, tuple[float, float, float]]])
+_WAYS = _LEFT | {
+    name.replace("left", "right"): (parent.replace("left", "right"), (-x, y, z))
+    for name, (parent, (x, y, z)) in _LEFT.items()
+    if name.startswith("left")
 }
-"""T pose of a person of average build: each joint's parent and offset from it in metres, for the
-left side and the middle; x is left, y up, z front."""
-
-_IN_FRONT = {"index": 0.02, "middle": 0.0, "pinky": -0.04, "ring": -0.02, "thumb": 0.03}
-"""Offset of each finger in front of the middle one, in metres."""
-
-
-def _ways() -> dict[str, tuple[str, tuple[float, float, float]]]:
-    left = dict(_WAYS)
-    for finger, aside in _IN_FRONT.items():
-        first = 0.03 if finger == "thumb" else 0.1
-        left[f"left_{finger}1"] = "left_wrist", (first, -0.01, aside)
-        for number in (2, 3):
-            left[f"left_{finger}{number}"] = f"left_{finger}{number - 1}", (0.03, 0.0, 0.0)
-    right = {
-        name.replace("left", "right"): (parent.replace("left", "right"), (-x, y, z))
-        for name, (parent, (x, y, z)) in left.items()
-        if name.startswith("left")
-    }
-    return left | right
+"""T pose of a person of average build: each joint's parent and offset from it in metres."""
 
 
 def axes_of_smpl(motion: SmplMotion) -> FloatArray:
@@ -661,7 +630,7 @@ def skeleton_of_smpl(motion: SmplMotion, nominal_rate: float) -> NodeMotion:
     ----------
     nominal_rate : frames per second, if the motion does not define them
     """
-    ways, numbers = _ways(), {name: number for number, name in enumerate(motion.names)}
+    ways, numbers = _WAYS, {name: number for number, name in enumerate(motion.names)}
     # Order parents first; leave out joints without rotations.
     depth = {"": 0}
     order: list[str] = []

@@ -11,11 +11,11 @@ import pytest
 
 from lcollision_core import jobs
 from lcollision_core.bodies import RigBody, poses_by_rig, rest_pose_set
-from lcollision_core.bodies.rig_poses import HUMAN, HumanDraws, random_codes
+from lcollision_core.bodies.rig_poses import HumanDraws, random_codes
 from lcollision_core.errors import CancelledError, LCollisionError, PoseSetError, ShapeError
 from lcollision_core.files import PoseSet
 from lcollision_core.jobs import Job
-from lcollision_core.meshes.joint_kinds import Role
+from lcollision_core.meshes.joint_kinds import JOINT_KINDS, Role
 from tests.rigged_shapes import rigged_body, rigged_tube
 
 SCALE = 100.0
@@ -126,7 +126,7 @@ def test_arms_that_hang_at_rest_are_raised_from_there() -> None:
             hanging[rig.joint_names.index(side + name), :3, 3] = [0.2 * sign, 0.0, 1.45 - drop]
     body = RigBody.of(replace(character, rig=replace(rig, rest=hanging)))
     limits = np.degrees(HumanDraws(body.space).limits)
-    (down, up), most = HUMAN[Role.UPPER_ARM][2], 120.0
+    (down, up), most = JOINT_KINDS[Role.UPPER_ARM].comfortable[2], 120.0
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         aside = sign * limits[joint_of(body, side + "Arm"), 2]
         np.testing.assert_allclose(sorted(aside), [down + 90.0, min(up + 90.0, most)], atol=1e-6)
