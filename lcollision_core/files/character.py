@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -94,18 +94,16 @@ class CharacterFile:
     @cached_property
     def stored_normals(self) -> list[FloatArray | None]:
         """The (n, 3) normals that the file stores for each part's vertices, None if it has none."""
-        return list(self._stored_normals())
+        return [self._normals_of(part) for _, part, _ in self.parts]
 
-    def _stored_normals(self) -> Iterator[FloatArray | None]:
-        for _, part, _ in self.parts:
-            mesh = self.document.objects("meshes")[part.mesh]
-            number = mesh["primitives"][part.primitive]["attributes"].get("NORMAL")
-            if number is None:
-                yield None
-                continue
-            what = f"the normals of mesh {part.mesh}"
-            stored = self.document.array(number, what, ("VEC3",), part.n_vertices)
-            yield np.tile(as_float(stored), (part.n_instances, 1))
+    def _normals_of(self, part: Primitive) -> FloatArray | None:
+        mesh = self.document.objects("meshes")[part.mesh]
+        number = mesh["primitives"][part.primitive]["attributes"].get("NORMAL")
+        if number is None:
+            return None
+        what = f"the normals of mesh {part.mesh}"
+        stored = self.document.array(number, what, ("VEC3",), part.n_vertices)
+        return np.tile(as_float(stored), (part.n_instances, 1))
 
     def normals(self, vertices: FloatArray) -> FloatArray:
         """Return the unit normals of the file's W vertices in a pose; 0 where none are stored."""
@@ -334,6 +332,41 @@ class Character:
     no_rig: str = NO_JOINTS
     file: CharacterFile | None = None
     smpl: SmplModel | None = None
+
+    @classmethod
+    def without_clips(
+        cls,
+        path: Path,
+        topology: Topology,
+        vertices: FloatArray,
+        up: FloatArray,
+        rig: Rig | None,
+        *,
+        up_is_sure: bool = True,
+        notes: tuple[str, ...] = (),
+        smpl: SmplModel | None = None,
+    ) -> Character:
+        """Make a character that is not from a scene, whose vertices are those of its file."""
+
+        def sample(clip: str, _: float | FloatArray | None) -> ClipFrames:
+            raise MeshFileError(f"has no animation {clip!r}", "name a motion", where=path)
+
+        return cls(
+            name=path.stem,
+            source=path,
+            topology=topology,
+            rest_vertices=vertices,
+            joined=np.arange(len(vertices)),
+            up=up,
+            up_is_sure=up_is_sure,
+            metres=1.0,
+            groups=(),
+            rig=rig,
+            clips={},
+            sample=sample,
+            notes=notes,
+            smpl=smpl,
+        )
 
     def look(self) -> Appearance | None:
         """Read its appearance, which is slow the first time; None if no file defines it.

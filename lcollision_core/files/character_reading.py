@@ -210,25 +210,8 @@ def character_of_smpl(
         moving=np.array([moving is None or name in moving for name in model.names]),
         pose_shapes=model.pose_directions,
     )
-
-    def sample(clip: str, _: float | FloatArray | None) -> ClipFrames:
-        raise MeshFileError(f"has no animation {clip!r}", "name a motion", where=model.path)
-
-    return Character(
-        model.path.stem,
-        model.path,
-        model.topology,
-        vertices,
-        np.arange(len(vertices)),
-        np.array([0.0, 1.0, 0.0]),
-        True,
-        1.0,
-        (),
-        rig,
-        {},
-        sample,
-        smpl=model,
-    )
+    up = np.array([0.0, 1.0, 0.0])
+    return Character.without_clips(model.path, model.topology, vertices, up, rig, smpl=model)
 
 
 _HIDDEN = 1e-3

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import ValidationError, convert
 
 from lcollision_core.errors import MeshFileError, ShapeError, UnwritablePoseError
 from lcollision_core.files.character import (
@@ -107,6 +108,16 @@ def _brief(source: dict[str, Any]) -> list[dict[str, Any]]:
     return briefs
 
 
+@dataclass(frozen=True)
+class _Record:
+    """The checked entries of the record: see `add_source_record`."""
+
+    character: str
+    roles: dict[str, str]
+    source: dict[str, Any]
+    shown_by: list[int]
+
+
 @dataclass(frozen=True, eq=False)
 class OwnFile:
     """A file that this program wrote with a pose in it.
@@ -141,48 +152,37 @@ def read_own_file(document: SceneDocument) -> OwnFile | None:
         description = extras.get(_KEY) if isinstance(extras, dict) else None
         if not isinstance(description, dict):
             return None
-        version = description.get("format_version")
-        if version != _VERSION:
+        if (version := description.get("format_version")) != _VERSION:
             raise MeshFileError.must_be(
                 "its version", _VERSION, quoted(version), "update LCollision"
             )
         if description.get("digest") != document.digest(_KEY):
             raise MeshFileError("another program has changed it since", "export it again")
-        shown_by, source, name = (
-            description.get("shown_by"),
-            description.get("source"),
-            description.get("character"),
-        )
-        roles = description.get("roles")
-        if not (
-            isinstance(source, dict)
-            and isinstance(name, str)
-            and isinstance(shown_by, list)
-            and all(type(node) is int for node in shown_by)
-            and isinstance(roles, dict)
-            and all(isinstance(role, str) for role in roles.values())
-        ):
-            raise MeshFileError("what it says of its source is damaged", "export it again")
+        try:
+            record = convert(description, _Record)
+        except ValidationError as error:
+            what = "what it says of its source is damaged"
+            raise MeshFileError(what, "export it again") from error
         rules = ContactRules.from_json(description.get("rules"))
         posed = read_shown(document)
-        before = {key: source[key] for key in (*_CHANGED, _CLIPS) if key in source}
+        before = {key: record.source[key] for key in (*_CHANGED, _CLIPS) if key in record.source}
         source_document = document.described(document.description | before)
         character = character_of(scene_of(source_document), path)
-        printable_name = "".join(filter(str.isprintable, name))[:_LONGEST_NAME]
-        character = replace(character, name=printable_name or character.name, clips={})
+        name = "".join(filter(str.isprintable, record.character))[:_LONGEST_NAME]
+        character = replace(character, name=name or character.name, clips={})
         mesh = join_parts(posed)
         places = mesh.posed(posed.rest)[0][mesh.joined]
         rows: dict[int, list[FloatArray]] = {}
         starts = np.cumsum([0, *(len(part.points) for part in posed.parts)]).tolist()
         for part, start, end in zip(posed.parts, starts[:-1], starts[1:], strict=True):
             rows.setdefault(part.node, []).append(places[start:end])
-        in_order = [rows[node].pop(0) for node in shown_by if rows.get(node)]
+        in_order = [rows[node].pop(0) for node in record.shown_by if rows.get(node)]
         points = np.concatenate(in_order) if in_order else np.empty((0, 3))
         if points.shape != (len(character.joined), 3):
             raise MeshFileError("its vertices are not those of its source", "export it again")
         vertices = np.empty_like(character.rest_vertices)
         vertices[character.joined] = points
-        return OwnFile(character, vertices, rules, roles)
+        return OwnFile(character, vertices, rules, record.roles)
 
 
 _SAME = 1e-6
@@ -292,11 +292,9 @@ def write_character(
     with as_file_error(character.source, "cannot be written with this pose"):
         source = _Source(character, file)
         try:
-            if (
-                form is CharacterForm.JOINTS
-                and character.rig is not None
-                and transforms is not None
-            ):
+            if form is CharacterForm.JOINTS:
+                assert character.rig is not None
+                assert transforms is not None
                 stored = source.turn_joints(character.rig, transforms, shapes)
             elif form is CharacterForm.MORPH:
                 stored = source.add_morph(pose)
@@ -493,7 +491,7 @@ class _Source:
         self._shown_by = [part.node for part, _, _ in file.parts]
 
     def signed(self, rules: ContactRules) -> bytes:
-        """Return the bytes of the file, with the record of its source; see `sign`."""
+        """Return the bytes of the file, with the record of its source."""
         character, source = self._character, self._file.editable.description
         if character.rig is not None:
             add_source_record(self.patch, source, character, self._shown_by, rules)
@@ -521,7 +519,8 @@ class _Source:
             self._nodes[number]["weights"] = own[0].tolist()
 
         def hold(number: int, local: FloatArray) -> FloatArray:
-            node, kept = self._nodes[number], _held(self._nodes[number], local)
+            node = self._nodes[number]
+            kept = _held(node, local)
             for name, stored, new in zip(PARTS, stored_parts(node), kept, strict=True):
                 if "matrix" in node or not np.array_equal(stored, new):
                     node[name] = new.tolist()
@@ -571,8 +570,7 @@ class _Source:
             yield self._posed(rig, pose, hold, tuple(frame_weights))
         seconds = np.arange(len(transforms)) / clip.fps
         times = self.patch.add_array(seconds[:, None], has_bounds=True)
-        samplers: list[dict[str, Any]] = []
-        channels: list[dict[str, Any]] = []
+        animation: dict[str, Any] = {"name": name, "samplers": [], "channels": []}
         for number, tracks in keys.items():
             node = self._nodes[number]
             for part, stored, values in zip(PARTS, stored_parts(node), tracks, strict=True):
@@ -580,22 +578,13 @@ class _Source:
                     continue
                 if part == "rotation":
                     values *= signs_on_one_side(values)[:, None]
-                sampler = {"input": times, "output": self.patch.add_array(values)}
-                channels.append(
-                    {"sampler": len(samplers), "target": {"node": number, "path": part}}
-                )
-                samplers.append({**sampler, "interpolation": "LINEAR"})
+                self.patch.add_channel(animation, times, number, part, values)
             if node.pop("matrix", None) is not None:
                 # Animated nodes must not have a matrix.
                 node |= {part: track[0].tolist() for part, track in zip(PARTS, tracks, strict=True)}
         for number, values in self._reweighed(weights).items():
-            sampler = {"input": times, "output": self.patch.add_array(values.reshape(-1, 1))}
-            channels.append(
-                {"sampler": len(samplers), "target": {"node": number, "path": "weights"}}
-            )
-            samplers.append({**sampler, "interpolation": "LINEAR"})
-        if channels:
-            animation = {"name": name, "samplers": samplers, "channels": channels}
+            self.patch.add_channel(animation, times, number, "weights", values.reshape(-1, 1))
+        if animation["channels"]:
             self.patch.description.setdefault("animations", []).insert(place, animation)
 
     def _posed(
@@ -613,8 +602,6 @@ class _Source:
             the file
         weights : (1, M) weights of each part's morph targets
         """
-        if transforms.shape != rig.rest.shape or not np.isfinite(transforms).all():
-            raise ShapeError.must_be("transforms", f"of shape {rig.rest.shape}", transforms.shape)
         parents, rest = self._scene.parents, self._scene.rest.transforms[0]
         joints = set(rig.nodes.tolist())
         wanted_transforms, placed = rest.copy(), rest.copy()
@@ -712,7 +699,8 @@ class _Source:
                     "its joints flatten vertices at rest, which a morph target cannot undo"
                 ) from error
             deltas = (offsets - base).astype(np.float32)
-            stored[self._joined[rows]] = _moved(turns, base + deltas)
+            moved = np.einsum("vij,vj->vi", turns[:, :, :3], base + deltas)
+            stored[self._joined[rows]] = moved + turns[:, :, 3]
             mesh = self._file.editable.description["meshes"][shown_part.mesh]
             primitive = self._own_mesh(shown_part)["primitives"][shown_part.primitive]
             target = {"POSITION": self._vectors(deltas, has_bounds=True)}
@@ -841,22 +829,14 @@ class _Source:
         if np.array_equal(self._scene.rest.transforms[0, number], IDENTITY):
             return
         description = self.patch.description
-        if not node.keys() <= {
-            "name",
-            "mesh",
-            "translation",
-            "rotation",
-            "scale",
-            "matrix",
-            "extras",
-        }:
+        if not node.keys() <= {*PARTS, "matrix", "name", "mesh", "extras"}:
             # The node has further uses, such as children, so move only its mesh.
             self._nodes.append({"name": node.get("name", "mesh"), "mesh": node.pop("mesh")})
             new = len(self._nodes) - 1
             self._shown_by = [new if shown == number else shown for shown in self._shown_by]
             number = new
         else:
-            for name in ("translation", "rotation", "scale", "matrix"):
+            for name in (*PARTS, "matrix"):
                 node.pop(name, None)
             for other in self._nodes:
                 if number in other.get("children", ()):
@@ -897,8 +877,3 @@ def _kept(old: FloatArray, new: FloatArray) -> FloatArray:
     if np.abs(new - old).max() <= _SAME_NUMBER * np.abs(new).max():
         return old
     return new.astype(np.float32).astype(np.float64)
-
-
-def _moved(turns: FloatArray, points: FloatArray) -> FloatArray:
-    moved: FloatArray = np.einsum("vij,vj->vi", turns[:, :, :3], points) + turns[:, :, 3]
-    return moved

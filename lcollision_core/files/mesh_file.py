@@ -21,10 +21,10 @@ from lcollision_core.files.mesh.polygons import (
     triangulate,
     with_order_of,
 )
-from lcollision_core.files.safe import atomic_write, open_regular
+from lcollision_core.files.safe import atomic_write
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene.scene import Scene
-from lcollision_core.files.scene_files import as_file_error, document_of, scene_of
+from lcollision_core.files.scene_files import as_file_error, document_of, opened, scene_of
 from lcollision_core.files.table import (
     FILES,
     READABLE_SUFFIXES,
@@ -218,14 +218,7 @@ def coarseness_of(vertices: npt.NDArray[Any], topology: Topology) -> str | None:
 
 def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
     suffix = path.suffix.lower()
-    with open_regular(path) as file:
-        if suffix not in READABLE_SUFFIXES:
-            raise MeshFileError(
-                f"{suffix or 'a name without extension'} is not a known mesh format",
-                f"use one of {', '.join(READABLE_SUFFIXES)}",
-            )
-        if os.fstat(file.fileno()).st_size == 0:
-            raise MeshFileError("it is empty")
+    with opened(path, READABLE_SUFFIXES, "mesh format") as file:
         if suffix in SCENE_SUFFIXES:
             return _rest_pose(scene_of(document_of(file, path)), topology)
         polygons: Polygons = function_of(FILES[suffix].reader)(file, topology)

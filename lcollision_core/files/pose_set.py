@@ -49,8 +49,7 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 
 RULE_ARRAYS = ("rules", "group_names", "group_runs", "group_ends", "groups_about_joints")
 
-_MAX_RULES_LENGTH = 2_000_000
-_MAX_PROVENANCE_LENGTH = 2_000_000
+_MAX_JSON_LENGTH = 2_000_000
 
 
 def rules_to_arrays(rules: ContactRules) -> dict[str, npt.NDArray[Any]]:
@@ -69,17 +68,26 @@ def rules_from_arrays(arrays: Arrays, near_exclusion: float) -> ContactRules:
     MeshFileError : they are damaged.
     ShapeError : the near exclusion is invalid.
     """
-    stored = arrays.get("rules")
+
+    def rules_of(values: Any) -> ContactRules:
+        return replace(ContactRules.from_json(values), near_exclusion=near_exclusion)
+
+    rules: ContactRules | None = _json_in(arrays, "rules", "are damaged", rules_of)
+    return ContactRules(near_exclusion) if rules is None else rules
+
+
+def _json_in(arrays: Arrays, name: str, damage: str, convert: Callable[[Any], Any]) -> Any:
+    """Convert the JSON values that an array of one string holds; return None without it."""
+    stored = arrays.get(name)
     if stored is None:
-        return ContactRules(near_exclusion)
+        return None
     if stored.shape != () or stored.dtype.kind != "U":
-        raise MeshFileError.must_be("rules", "one string", f"{stored.dtype} {stored.shape}")
-    (text,) = texts_of(stored.reshape(1), "rules", _MAX_RULES_LENGTH)
+        raise MeshFileError.must_be(name, "one string", f"{stored.dtype} {stored.shape}")
+    (text,) = texts_of(stored.reshape(1), name, _MAX_JSON_LENGTH)
     try:
-        rules = ContactRules.from_json(parse_json(text.encode()))
-        return replace(rules, near_exclusion=near_exclusion)
+        return convert(parse_json(text.encode()))
     except ValueError as error:
-        raise MeshFileError.because("rules", "are damaged", error) from error
+        raise MeshFileError.because(name, damage, error) from error
 
 
 def groups_to_arrays(groups: Sequence[FaceGroup]) -> dict[str, npt.NDArray[Any]]:
@@ -153,16 +161,9 @@ def provenance_from_arrays(arrays: Arrays) -> dict[str, Any]:
     ------
     MeshFileError : it is damaged.
     """
-    stored = arrays.get("provenance")
-    if stored is None:
+    values = _json_in(arrays, "provenance", "is damaged", lambda values: values)
+    if values is None:
         return {}
-    if stored.shape != () or stored.dtype.kind != "U":
-        raise MeshFileError.must_be("provenance", "one string", f"{stored.dtype} {stored.shape}")
-    (text,) = texts_of(stored.reshape(1), "provenance", _MAX_PROVENANCE_LENGTH)
-    try:
-        values = parse_json(text.encode())
-    except ValueError as error:
-        raise MeshFileError.because("provenance", "is damaged", error) from error
     if not isinstance(values, dict):
         raise MeshFileError.must_be("provenance", "JSON values by name", type(values).__name__)
     return values
@@ -420,15 +421,10 @@ def collect_poses(
         return _collect_frames(path, report, job, clip, fps, topology)
     if exists and suffix == ".npz":
         return _without_outliers(_collect_npz(path, report, job), report)
-    if not exists:
-        what, next_step = "does not exist", "name a folder of meshes, a character or an .npz file"
-    elif suffix in READABLE_SUFFIXES:
+    what = "is not a pose set" if exists else "does not exist"
+    next_step = "name a folder of meshes, a character or an .npz file"
+    if exists and suffix in READABLE_SUFFIXES:
         what, next_step = "is one mesh, not a pose set", "name its folder"
-    else:
-        what, next_step = (
-            "is not a pose set",
-            "name a folder of meshes, a character or an .npz file",
-        )
     report(MeshFileError(what, next_step, where=path))
     return PoseSetInspection(None)
 
@@ -501,11 +497,13 @@ def _collect_folder(
         else:
             if topology is None:
                 topology = mesh.topology
-                too_large = _too_large(path, len(files), topology.n_vertices)
-                if too_large is not None:
-                    report(too_large)
+                shape = len(files), topology.n_vertices, 3
+                if np.prod(shape) > MAX_ITEMS:
+                    what = f"holds {shape[0]} poses of {shape[1]} vertices, more than {MAX_ITEMS}"
+                    advice = "keep fewer poses or decimate them"
+                    report(MeshFileError(f"{what} coordinates", advice, where=path))
                     return PoseSetInspection(None, len(files))
-                vertices = np.empty((len(files), topology.n_vertices, 3), dtype=np.float64)
+                vertices = np.empty(shape, dtype=np.float64)
             where = f"pose {pose} ({file.name})"
             if (defect := disagreement(where, mesh.topology, topology)) is not None:
                 same_topology = False
@@ -543,11 +541,8 @@ def disagreement(where: str, found: Topology, expected: Topology) -> PoseSetErro
         what, needed, got = "number of faces", expected.n_faces, found.n_faces
     elif different := np.flatnonzero((found.faces != expected.faces).any(axis=1)).tolist():
         face = different[0]
-        what, needed, got = (
-            f"face {face}",
-            expected.faces[face].tolist(),
-            found.faces[face].tolist(),
-        )
+        needed, got = (topology.faces[face].tolist() for topology in (expected, found))
+        what = f"face {face}"
     else:
         return None
     return PoseSetError(
@@ -556,16 +551,6 @@ def disagreement(where: str, found: Topology, expected: Topology) -> PoseSetErro
         where=where,
         expected=needed,
         got=got,
-    )
-
-
-def _too_large(path: Path, n_poses: int, n_vertices: int) -> MeshFileError | None:
-    if n_poses * n_vertices * 3 <= MAX_ITEMS:
-        return None
-    return MeshFileError(
-        f"holds {n_poses} poses of {n_vertices} vertices, more than {MAX_ITEMS} coordinates",
-        "keep fewer poses or decimate them",
-        where=path,
     )
 
 
@@ -594,14 +579,8 @@ def _collect_frames(
         groups=frames.groups,
         metres=frames.metres,
     )
-    kept_frames = []
-    for pose, vertices in enumerate(frames.vertices):
-        where = f"pose {pose} ({frames.names[pose]}) of {path}"
-        if (too_far := _too_far_to_compute(where, vertices)) is not None:
-            report(too_far)
-        else:
-            kept_frames.append(pose)
-    return PoseSetInspection(_only(pose_set, kept_frames), len(frames.vertices), same_topology=True)
+    usable = _usable(pose_set, report)
+    return PoseSetInspection(usable, len(frames.vertices), same_topology=True)
 
 
 def _collect_npz(
@@ -620,17 +599,25 @@ def _collect_npz(
     except LCollisionError as error:
         report(MeshFileError.because(path, "cannot be read as a pose set", error))
         return PoseSetInspection(None)
-    pose_numbers = []
-    for pose, mesh in enumerate(vertices):
-        where = f"pose {pose} ({pose_set.names[pose]}) of {path}"
-        if (too_far := _too_far_to_compute(where, mesh)) is not None:
+    usable = _usable(pose_set, report, is_rounded=vertices.dtype == np.float32)
+    job.report(len(vertices), len(vertices))
+    return PoseSetInspection(usable, len(vertices), same_topology=True)
+
+
+def _usable(
+    poses: PoseSet, report: Callable[[LCollisionError], None], *, is_rounded: bool = False
+) -> PoseSet | None:
+    """Return the poses that can be computed with; check how coarse they are if rounded."""
+    kept = []
+    for pose, vertices in enumerate(poses.vertices):
+        where = f"pose {pose} ({poses.names[pose]}) of {poses.source}"
+        if (too_far := _too_far_to_compute(where, vertices)) is not None:
             report(too_far)
-        elif mesh.dtype == np.float32 and (coarseness := coarseness_of(mesh, topology)):
+        elif is_rounded and (coarseness := coarseness_of(vertices, poses.topology)):
             report(PoseSetError(f"is damaged: {coarseness}", KEEP_PRECISION, where=where))
         else:
-            pose_numbers.append(pose)
-    job.report(len(vertices), len(vertices))
-    return PoseSetInspection(_only(pose_set, pose_numbers), len(vertices), same_topology=True)
+            kept.append(pose)
+    return _only(poses, kept)
 
 
 def _meshes_of(

@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from mimetypes import MimeTypes
 from pathlib import Path, PurePath
+from tokenize import TokenError
 from typing import IO, Any, BinaryIO
 
 import numpy as np
@@ -360,16 +361,9 @@ ZIP_DAMAGE = (
     OverflowError,
 )
 
-_MAGIC = b"\x93NUMPY"
-_MAX_HEADER_BYTES = 10_000
-_DESCR = re.compile(rb"'descr': *'([<>|=]?)([a-zA-Z])([0-9]{0,9})'")
-_ORDER = re.compile(rb"'fortran_order': *(True|False)")
-_SHAPE = re.compile(rb"'shape': *\(([0-9, ]*)\)")
 _PLAIN_KINDS = "biufSU"
 _MOST_DEFLATED = 1032
 """Most bytes that one byte of a compressed entry expands to."""
-
-_CHUNK_BYTES = 1 << 24
 
 
 def read_npz(
@@ -423,63 +417,50 @@ def read_npz(
 
 
 def _read_array(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> npt.NDArray[Any]:
+    where = f"its array {name!r}"
     with archive.open(info) as file:
-        dtype, in_fortran_order, shape = _read_header(file, name)
+        shape, _, dtype = read_header(file)
+        if dtype.hasobject:
+            raise MeshFileError(
+                "holds Python objects, which are not loaded because that can run code",
+                "save plain numbers",
+                where=where,
+            )
+        if dtype.kind not in _PLAIN_KINDS:
+            raise MeshFileError(f"is of type {dtype.str!r}", "save plain numbers", where=where)
         # Use Python integers: the product of damaged sizes could overflow NumPy's.
         n_items = math.prod(shape)
         if n_items > MAX_ITEMS:
             count = n_items if n_items < 10**15 else "over 10**15"
             raise MeshFileError(
-                f"holds {count} numbers, at most {MAX_ITEMS} can be read",
-                where=f"its array {name!r}",
+                f"holds {count} numbers, at most {MAX_ITEMS} can be read", where=where
             )
         # Do not allocate memory for a size that the data cannot fill.
-        if n_items * dtype.itemsize > min(info.file_size, _MOST_DEFLATED * info.compress_size):
+        n_bytes = n_items * dtype.itemsize
+        if not dtype.itemsize or n_bytes > min(info.file_size, _MOST_DEFLATED * info.compress_size):
             raise EOFError
-        array = np.empty(n_items, dtype)
-        _fill(file, array)
-    shaped: npt.NDArray[Any] = array.reshape(shape, order="F" if in_fortran_order else "C")
-    return shaped
+        file.seek(0)
+        array: npt.NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+    return array
 
 
-def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype[Any], bool, tuple[int, ...]]:
-    """Parse a header that NumPy wrote, without evaluating it as NumPy's own reader does."""
-    start = file.read(8)
-    n_length_bytes = 2 if start[6:7] == b"\1" else 4
-    length = int.from_bytes(file.read(n_length_bytes), "little")
-    if not start.startswith(_MAGIC) or length > _MAX_HEADER_BYTES:
-        raise ValueError("no array")
-    header = file.read(length)
-    descr, order, shape = (part.search(header) for part in (_DESCR, _ORDER, _SHAPE))
-    if descr is None or order is None or shape is None:
-        raise ValueError("no plain array")
-    byte_order, kind, size = (part.decode() for part in descr.groups())
-    if kind == "O":
-        raise MeshFileError(
-            "holds Python objects, which are not loaded because that can run code",
-            "save plain numbers",
-            where=f"its array {name!r}",
-        )
-    if kind not in _PLAIN_KINDS:
-        raise MeshFileError(
-            f"is of type {kind + size!r}", "save plain numbers", where=f"its array {name!r}"
-        )
-    dtype = np.dtype(f"{byte_order}{kind}{size}")
-    if not dtype.itemsize:
-        raise ValueError("items without a size")
-    sizes = tuple(int(part) for part in shape[1].split(b",") if part.strip())
-    return dtype, order[1] == b"True", sizes
+def read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Read the shape, order and dtype of a NumPy array, whose values follow.
 
-
-def _fill(file: IO[bytes], array: npt.NDArray[Any]) -> None:
-    """Read an array's bytes in chunks, so that a truncated file takes little memory."""
-    data = array.view(np.uint8)
-    for start in range(0, len(data), _CHUNK_BYTES):
-        part = data[start : start + _CHUNK_BYTES]
-        chunk = file.read(len(part))
-        if len(chunk) < len(part):
-            raise EOFError
-        part[:] = np.frombuffer(chunk, np.uint8)
+    Raises
+    ------
+    ValueError : it is not a NumPy array.
+    """
+    if file.read(6) != b"\x93NUMPY":
+        raise ValueError("it is no array of NumPy")
+    file.seek(0)
+    try:
+        is_short = np.lib.format.read_magic(file) == (1, 0)
+        read = np.lib.format
+        return (read.read_array_header_1_0 if is_short else read.read_array_header_2_0)(file)
+    except (SyntaxError, TokenError) as error:
+        # NumPy parses the header as a Python dict.
+        raise ValueError("its header is damaged") from error
 
 
 def write_npz(file: BinaryIO, arrays: Mapping[str, npt.NDArray[Any]]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, TypeAlias
@@ -36,7 +36,7 @@ def open_scene(path: str | os.PathLike[str], job: Job = UNWATCHED) -> SceneDocum
     ------
     MeshFileError : the file is missing, damaged or too large. The message names the file.
     """
-    with as_file_error(path), _opened(path) as file:
+    with as_file_error(path), opened(path, SCENE_SUFFIXES) as file:
         return document_of(file, Path(path), job)
 
 
@@ -93,13 +93,16 @@ def is_animation_alone(document: SceneDocument) -> bool:
 
 
 @contextmanager
-def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+def opened(
+    path: str | os.PathLike[str], suffixes: Sequence[str], kind: str = "format of characters"
+) -> Iterator[BinaryIO]:
+    """Open a file with one of these extensions that is not empty; errors do not name it."""
     suffix = Path(path).suffix.lower()
     with open_regular(path) as file:
-        if suffix not in SCENE_SUFFIXES:
+        if suffix not in suffixes:
             raise MeshFileError(
-                f"{suffix or 'a name without extension'} is not a known format of characters",
-                f"use one of {', '.join(SCENE_SUFFIXES)}",
+                f"{suffix or 'a name without extension'} is not a known {kind}",
+                f"use one of {', '.join(suffixes)}",
             )
         if os.fstat(file.fileno()).st_size == 0:
             raise MeshFileError("it is empty")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -60,22 +60,22 @@ class _Finish:
 _NO_FINISH = _Finish(Material(is_double_sided=False), np.ones(4), 0, np.eye(2), np.zeros(2))
 
 
+@dataclass(eq=False)
 class GltfLooks:
     """Reads the appearance of a file's primitives, each image and material once.
 
     Damaged values are left out with a note.
 
-    Parameters
+    Attributes
     ----------
     document : the file
     """
 
-    def __init__(self, document: GltfDocument) -> None:
-        self._document = document
-        self._images = ImageReader()
-        self._pixels: dict[int, npt.NDArray[np.uint8]] = {}
-        self._textures: dict[int, Texture] = {}
-        self._finishes: dict[int, _Finish] = {}
+    document: GltfDocument
+    _images: ImageReader = field(default_factory=ImageReader)
+    _pixels: dict[int, npt.NDArray[np.uint8]] = field(default_factory=dict)
+    _textures: dict[int, Texture] = field(default_factory=dict)
+    _finishes: dict[int, _Finish] = field(default_factory=dict)
 
     def appearance(
         self,
@@ -113,15 +113,14 @@ class GltfLooks:
                 material = replace(material, texture=None)
                 what = f"the texture coordinates of {where}"
                 given = attributes.get(f"TEXCOORD_{finish.uv_set}")
-                stored = as_float(self._document.array(given, what, ("VEC2",), n))
+                stored = as_float(self.document.array(given, what, ("VEC2",), n))
                 require_finite(stored, what)
                 uv, material = stored @ finish.turned.T + finish.offset, finish.material
             elif "TEXCOORD_0" in attributes:
                 # Nothing uses them on screen, but exports keep them.
                 what = f"the texture coordinates of {where}"
-                stored = as_float(
-                    self._document.array(attributes["TEXCOORD_0"], what, ("VEC2",), n)
-                )
+                given = attributes["TEXCOORD_0"]
+                stored = as_float(self.document.array(given, what, ("VEC2",), n))
                 uv = stored if np.isfinite(stored).all() else uv
         return Appearance(
             np.arange(n_copies * n),
@@ -135,7 +134,7 @@ class GltfLooks:
 
     def _vertex_colours(self, accessor: object, where: str, n: int) -> FloatArray:
         what = f"the colours of {where}"
-        stored = self._document.array(accessor, what, ("VEC3", "VEC4"), n)
+        stored = self.document.array(accessor, what, ("VEC3", "VEC4"), n)
         # Some programs do not mark their integers as normalised.
         most = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1.0
         colours = np.ones((n, 4))
@@ -144,7 +143,7 @@ class GltfLooks:
         return colours
 
     def _finish(self, number: int) -> _Finish:
-        described = self._document.objects("materials")[number]
+        described = self.document.objects("materials")[number]
         name = quoted(described.get("name") or number)
         finish, notes = _NO_FINISH, list[str]()
         # Keep the colour even if the texture is damaged.
@@ -184,7 +183,7 @@ class GltfLooks:
         )
 
     def _texture(self, index: Any) -> Texture:
-        document = self._document
+        document = self.document
         texture = require_element(document.objects("textures"), index, "a texture")
         if index in self._textures:
             return self._textures[index]

@@ -57,7 +57,7 @@ def _meshopt(document: GltfDocument, held: dict[str, Any], what: str) -> bytes:
     count = require_int(held.get("count"), f"the count of {what}", 0, 3 * MAX_FACES)
     most = min(_MOST_STRIDE, MAX_FILE_BYTES // max(count, 1))
     stride = require_int(held.get("byteStride"), f"the stride of {what}", 1, most)
-    data = document.bytes_of(held, what)
+    data = bytes(document.bytes_of(held, what))
     return decode(data, count, stride, str(held.get("mode")), str(held.get("filter", "NONE")))
 
 
@@ -94,7 +94,7 @@ def _draco(
     )
     if number not in unpacked:
         try:
-            unpacked[number] = DracoPy.decode(document.bytes_of(views[number], where))
+            unpacked[number] = DracoPy.decode(bytes(document.bytes_of(views[number], where)))
         except (ValueError, RuntimeError, DracoPy.FileTypeException) as error:
             raise MeshFileError(
                 "its compressed data (Draco) are damaged", "export it again", where=where

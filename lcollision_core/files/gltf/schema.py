@@ -252,10 +252,8 @@ class GltfDocument:
         view = require_element(
             self.objects("bufferViews"), stored.get("bufferView"), f"buffer view of {what}"
         )
-        buffer = self.buffer(view.get("buffer"), what)
-        start = require_int(view.get("byteOffset", 0), f"the offset of {what}", 0, len(buffer))
-        most = len(buffer) - start
-        length = require_int(view.get("byteLength"), f"the length of {what}", 0, most)
+        content = self.bytes_of(view, what)
+        length = len(content)
         inside = require_int(stored.get("byteOffset", 0), f"the offset of {what}", 0, length)
         size = width * dtype.itemsize
         stride = require_int(view.get("byteStride", size), f"the stride of {what}", size, 1 << 16)
@@ -264,9 +262,8 @@ class GltfDocument:
             raise MeshFileError(
                 f"it is truncated: {what} need {needed} bytes, there are {length - inside}"
             )
-        at = start + inside if n else 0
         strides = (stride, dtype.itemsize)
-        return np.ndarray((n, width), dtype, buffer if n else b"", at, strides)
+        return np.ndarray((n, width), dtype, content if n else b"", inside if n else 0, strides)
 
     def has_buffer(self, index: object) -> bool:
         """Whether a buffer has bytes; one without stands for compressed data."""
@@ -305,13 +302,13 @@ class GltfDocument:
                 raise MeshFileError(f"it has no data for {what}")
         return self._buffers[number]
 
-    def bytes_of(self, stored: dict[str, Any], what: str) -> bytes:
-        """Return the bytes of an object with the fields of a buffer view; raises as `buffer`."""
+    def bytes_of(self, stored: dict[str, Any], what: str) -> memoryview:
+        """View the bytes of an object with the fields of a buffer view; raises as `buffer`."""
         buffer = self.buffer(stored.get("buffer"), what)
         start = require_int(stored.get("byteOffset", 0), f"the offset of {what}", 0, len(buffer))
         most = len(buffer) - start
         length = require_int(stored.get("byteLength"), f"the length of {what}", 0, most)
-        return bytes(buffer[start : start + length])
+        return memoryview(buffer)[start : start + length]
 
     def image(self, described: dict[str, Any], what: str) -> bytes:
         """Return the bytes of an image file, which is in this file or beside it.
@@ -329,8 +326,7 @@ class GltfDocument:
             return resource(described["uri"], self.path, MAX_FILE_BYTES, what)
         views, index = self.objects("bufferViews"), described.get("bufferView")
         view = require_element(views, index, f"the buffer view of {what}")
-        length = require_int(view.get("byteLength"), f"the length of {what}", 0, MAX_FILE_BYTES)
-        return self._view(described, what, length, 1, np.dtype("u1")).tobytes()
+        return bytes(self.bytes_of(view, what))
 
     def _embed(self, image: dict[str, Any]) -> None:
         uri = image.get("uri")
@@ -404,6 +400,22 @@ class GltfDocument:
         accessors = self.description.setdefault("accessors", [])
         accessors.append(accessor)
         return len(accessors) - 1
+
+    def add_channel(
+        self, animation: dict[str, Any], times: int, node: int, path: str, values: FloatArray
+    ) -> None:
+        """Add linear keys of a node's property to an animation with `channels` and `samplers`.
+
+        Parameters
+        ----------
+        times : the accessor of the T times
+        values : (T, k) array
+        """
+        samplers = animation["samplers"]
+        target = {"node": node, "path": path}
+        animation["channels"].append({"sampler": len(samplers), "target": target})
+        output = self.add_array(values)
+        samplers.append({"input": times, "output": output, "interpolation": "LINEAR"})
 
     def digest(self, key: str) -> str:
         """Return the SHA-256 of everything but the entry `key` of the asset's extras, in hex.

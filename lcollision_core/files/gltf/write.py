@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -340,15 +341,8 @@ class _Maker:
         self, number: int, name: str, moved: frozenset[int], delay: float
     ) -> dict[str, Any]:
         times = self._file.add_array((self._times[name] + delay)[:, None], has_bounds=True)
-        samplers: list[dict[str, Any]] = []
-        channels: list[dict[str, Any]] = []
-
-        def add(node: int, path: str, values: FloatArray) -> None:
-            output = self._file.add_array(values)
-            target = {"node": node, "path": path}
-            channels.append({"sampler": len(samplers), "target": target})
-            samplers.append({"input": times, "output": output, "interpolation": "LINEAR"})
-
+        animation: dict[str, Any] = {"name": name, "channels": [], "samplers": []}
+        add = partial(self._file.add_channel, animation, times)
         size = float(np.abs(self._wanted[0][..., :3, 3]).max())
         for node, tracks in enumerate(self._tracks):
             for path, rest, values in zip(PARTS, tracks[0], tracks[number], strict=True):
@@ -364,10 +358,10 @@ class _Maker:
             rest, values = (self._poses[pose].weights[index] for pose in (0, number))
             if values.size and (values != rest).any():
                 add(part.node, "weights", values.reshape(-1, 1))
-        if not channels:
+        if not animation["channels"]:
             # A clip needs at least one channel.
             add(0, "translation", self._tracks[0][number][0])
-        return {"name": name, "channels": channels, "samplers": samplers}
+        return animation
 
     def _vectors(self, values: npt.NDArray[Any], *, has_bounds: bool = False) -> int:
         return self._file.add_array(values, has_bounds=has_bounds, target=VERTEX_DATA)

@@ -13,17 +13,16 @@ import pickle
 import re
 from dataclasses import replace
 from pathlib import Path
-from tokenize import TokenError
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.files.motion.node_motion import NodeMotion, least_turns
+from lcollision_core.files.motion.node_motion import NodeMotion, least_turns, relative_to_parents
 from lcollision_core.files.motion.smpl import BODY_JOINTS, array_names
-from lcollision_core.files.safe import open_regular, read_npz
+from lcollision_core.files.safe import open_regular, read_header, read_npz
 from lcollision_core.meshes.topology import FloatArray
 
 _PLACES, _TURNS = "posed_joints", "global_rot_mats"
@@ -91,7 +90,7 @@ def holds_joints(path: str | os.PathLike[str]) -> bool:
     """Whether a .npy file has a shape that can be read here; never raises."""
     try:
         with open_regular(path) as file:
-            shape, _, dtype = _header(file)
+            shape, _, dtype = read_header(file)
     except (MeshFileError, OSError, ValueError, EOFError):
         return False
     return dtype.hasobject or shape[1:] in (_JOINTS, _VECTORS)
@@ -145,25 +144,6 @@ def _filled(places: FloatArray) -> tuple[int, tuple[str, ...]]:
     return n_frames, (cut,) if n_filling else ()
 
 
-def _header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read the shape, order and dtype of a NumPy array, whose values follow.
-
-    Raises
-    ------
-    MeshFileError, ValueError : it is not a NumPy array.
-    """
-    if file.read(6) != b"\x93NUMPY":
-        raise MeshFileError("it is no array of NumPy")
-    file.seek(0)
-    try:
-        is_short = np.lib.format.read_magic(file) == (1, 0)
-        read = np.lib.format
-        return (read.read_array_header_1_0 if is_short else read.read_array_header_2_0)(file)
-    except (SyntaxError, TokenError) as error:
-        # NumPy parses the header as a Python dict.
-        raise MeshFileError("its header is damaged") from error
-
-
 def _samples(path: Path) -> list[tuple[str, FloatArray, str]]:
     """Return the motions of a .npy file: name, (T, 22, 3) joint positions and description."""
     expected = (
@@ -173,7 +153,7 @@ def _samples(path: Path) -> list[tuple[str, FloatArray, str]]:
     with open_regular(path) as file:
         if os.fstat(file.fileno()).st_size > _MOST_BYTES:
             raise MeshFileError("it is too large")
-        shape, _, dtype = _header(file)
+        shape, _, dtype = read_header(file)
         content = read_plain_pickle(file.read()) if dtype.hasobject else None
     if content is not None:
         motion = content.get("motion") if isinstance(content, dict) else None
@@ -249,14 +229,7 @@ def _motion(
 ) -> NodeMotion:
     """Return the motion of joints with these global positions and rotations."""
     parents = np.array(list(skeleton.values()))
-    root_places, local = places.copy(), turns.copy()
-    for joint, parent in enumerate(parents.tolist()):
-        if parent >= 0:
-            back = np.swapaxes(turns[:, parent], 1, 2)
-            local[:, joint] = back @ turns[:, joint]
-            root_places[:, joint] = np.einsum(
-                "txy,ty->tx", back, places[:, joint] - places[:, parent]
-            )
+    local, root_places = relative_to_parents(parents, turns, places)
     offsets = root_places.mean(axis=0) * (parents >= 0)[:, None]
     axes = np.broadcast_to(np.eye(3), (len(parents), 3, 3)).copy()
     times, ends = np.arange(len(places)) / rate, np.full(offsets.shape, np.nan)

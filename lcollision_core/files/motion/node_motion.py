@@ -101,23 +101,33 @@ def motion_of_nodes(
     rest, moved = scene.rest.transforms[0, order], poses.transforms[:, order]
     at_rest, in_motion = rotations_of(rest), rotations_of(moved)
     axes = _bound_axes(scene, order, at_rest)
-    turns: FloatArray = in_motion @ np.swapaxes(axes, -2, -1)
-    world, places = turns.copy(), moved[..., :3, 3].copy()
+    world = in_motion @ np.swapaxes(axes, -2, -1)
+    turns, places = relative_to_parents(parents, world, moved[..., :3, 3])
     offsets = rest[:, :3, 3].copy()
     # A joint that the bind pose turns carries its children along.
     changed = axes @ np.swapaxes(at_rest, -2, -1)
     for joint, parent in enumerate(parents.tolist()):
         if parent >= 0:
             offsets[joint] = changed[parent] @ (rest[joint, :3, 3] - rest[parent, :3, 3])
-            back = np.swapaxes(world[:, parent], 1, 2)
-            turns[:, joint] = back @ world[:, joint]
-            way = moved[:, joint, :3, 3] - moved[:, parent, :3, 3]
-            places[:, joint] = np.einsum("txy,ty->tx", back, way)
     ends = np.full(offsets.shape, np.nan)
     since, up = times - times[0], scene.up
     return NodeMotion(
         clip.name, tuple(names), parents, offsets, ends, axes, since, up, turns, places
     )
+
+
+def relative_to_parents(
+    parents: npt.NDArray[np.int64], turns: FloatArray, places: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return (T, J, 3, 3) rotations and (T, J, 3) positions in the world relative to parents."""
+    local_turns, local_places = turns.copy(), places.copy()
+    for joint, parent in enumerate(parents.tolist()):
+        if parent >= 0:
+            back = np.swapaxes(turns[:, parent], 1, 2)
+            local_turns[:, joint] = back @ turns[:, joint]
+            way = places[:, joint] - places[:, parent]
+            local_places[:, joint] = np.einsum("txy,ty->tx", back, way)
+    return local_turns, local_places
 
 
 def motions_of_scene(

@@ -99,24 +99,19 @@ def vrma_bytes(
         if parent >= 0:
             nodes[parent].setdefault("children", []).append(number)
     at = file.add_array((times - times[0])[:, None], has_bounds=True)
-    samplers: list[dict[str, Any]] = []
-    channels: list[dict[str, Any]] = []
-
-    def move(node: int, path: str, values: FloatArray) -> None:
-        channels.append({"sampler": len(samplers), "target": {"node": node, "path": path}})
-        samplers.append({"input": at, "output": file.add_array(values), "interpolation": "LINEAR"})
-
-    move(0, "translation", hips)
+    animation: dict[str, Any] = {"channels": [], "samplers": []}
+    file.add_channel(animation, at, 0, "translation", hips)
     for number in range(len(names)):
         turned = Rotation.from_matrix(turns[:, number]).as_quat()
         # Make interpolation between keys take the shorter arc.
-        move(number, "rotation", turned * signs_on_one_side(turned)[:, None])
+        turned *= signs_on_one_side(turned)[:, None]
+        file.add_channel(animation, at, number, "rotation", turned)
     bones = {name: {"node": number} for number, name in enumerate(names)}
     file.description |= {
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": nodes,
-        "animations": [{"channels": channels, "samplers": samplers}],
+        "animations": [animation],
         "extensionsUsed": [_EXTENSION],
         "extensions": {_EXTENSION: {"specVersion": "1.0", "humanoid": {"humanBones": bones}}},
     }

@@ -150,11 +150,11 @@ _MOST_BYTES = 1 << 29
 """Most bytes of all images of a file together, after downscaling."""
 
 
+@dataclass(eq=False)
 class ImageReader:
     """Decodes the images of one file, up to a limit for all together."""
 
-    def __init__(self) -> None:
-        self._left = _MOST_BYTES
+    _left: int = _MOST_BYTES
 
     def read(self, data: bytes, what: str) -> npt.NDArray[np.uint8]:
         """Decode an image.
