@@ -364,9 +364,9 @@ class Body(ABC):
         return None
 
     @property
-    @abstractmethod
     def is_trained(self) -> bool:
         """Whether the pose space was learned from the poses that came with the body."""
+        return False
 
     @property
     def has_predictor(self) -> bool:
@@ -411,9 +411,9 @@ class Body(ABC):
         """Why there is no predictor, and advice."""
 
     @property
-    @abstractmethod
     def can_resolve(self) -> bool:
         """Whether colliding poses can be resolved; loads nothing."""
+        return True
 
     @property
     @abstractmethod
@@ -807,10 +807,22 @@ class Body(ABC):
         """Why poses cannot be mirrored; "" if they can."""
         return "" if self.symmetry is not None else f"Cannot be mirrored: {self.no_sides[0]}"
 
-    def _not_mirrored(self) -> LCollisionError:
-        reason, next_step = self.no_sides
-        where = f"poses of {self.name}"
-        return LCollisionError(f"cannot be mirrored: {reason}", next_step, where=where)
+    def _mirror_parts(
+        self,
+    ) -> tuple[
+        npt.NDArray[np.float32],
+        Symmetry,
+        ExactCheck,
+        Callable[[FloatArray, Job], FloatArray],
+        Callable[..., ResolveResult] | None,
+    ]:
+        """Return the arguments of `PoseMirror`; raise as `pose_mirror`."""
+        if self.symmetry is None:
+            reason, next_step = self.no_sides
+            where = f"poses of {self.name}"
+            raise LCollisionError(f"cannot be mirrored: {reason}", next_step, where=where)
+        resolve = self.resolve if self.can_resolve else None
+        return self.attention_mask, self.symmetry, self.exact_check(), self.nearest, resolve
 
     @cached_property
     def pose_mirror(self) -> PoseMirror:
@@ -821,12 +833,7 @@ class Body(ABC):
         LCollisionError : the mesh is not symmetric.
         ModelFileError : the model's predictor is damaged.
         """
-        if self.symmetry is None:
-            raise self._not_mirrored()
-        resolve = self.resolve if self.can_resolve else None
-        return PoseMirror(
-            self.attention_mask, self.symmetry, self.exact_check(), self.nearest, resolve
-        )
+        return PoseMirror(*self._mirror_parts())
 
     @cached_property
     def latent_space(self) -> LatentSpace:

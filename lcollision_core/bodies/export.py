@@ -53,11 +53,7 @@ _AXES = np.eye(3)
 _X, _Y, _Z = _AXES
 
 
-_UNITS_IN_A_METRE = {
-    ExportAxes.BLENDER: 1.0,
-    ExportAxes.MAYA: 100.0,
-    ExportAxes.UNREAL: 100.0,
-}
+_UNITS_IN_A_METRE = {ExportAxes.BLENDER: 1.0, ExportAxes.MAYA: 100.0, ExportAxes.UNREAL: 100.0}
 
 _ALREADY_FIXED = (".glb", ".vrm")
 """glTF is always y up, z forward, in metres."""

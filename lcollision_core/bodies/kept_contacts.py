@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -76,7 +77,9 @@ class Correspondence:
 
     def by_place(self) -> npt.NDArray[np.int64]:
         """Find `image` limb by limb, independent of the topologies."""
-        space, source, frame = self.retargeting.space, self.source, self._least_bent
+        space, source = self.retargeting.space, self.source
+        # The least bent pose.
+        frame = int(np.abs(self.motion.codes[:, ROOT_CODES:]).sum(axis=1).argmin())
         partner, trunk = self.retargeting.partner, _trunk(space)
         listed = [*enumerate(self.retargeting.motion.names)]
         names = {common_name(name): joint for joint, name in reversed(listed)}
@@ -111,10 +114,6 @@ class Correspondence:
                 places.append(_places(side, axis, space.front, space.up))
             image[inside] = own_vertices[cKDTree(places[1]).query(places[0])[1]]
         return image
-
-    @cached_property
-    def _least_bent(self) -> int:
-        return int(np.abs(self.motion.codes[:, ROOT_CODES:]).sum(axis=1).argmin())
 
     def patch(self, middle: FloatArray, limb: int, radius: float) -> npt.NDArray[np.intp]:
         """Return the faces of a limb near a place at rest, at least one."""
@@ -284,19 +283,6 @@ def _at(
     return points
 
 
-@dataclass(eq=False)
-class _Found:
-    """A contact of the source body.
-
-    Attributes
-    ----------
-    vertices : the central vertex on each side, by frame
-    """
-
-    name: tuple[str, str]
-    vertices: dict[int, tuple[int, int]] = field(default_factory=dict)
-
-
 def contacts_of(
     body: Body, motion: Motion, source: Body, source_motion: Motion, retargeting: Retargeting
 ) -> KeptContacts:
@@ -322,26 +308,32 @@ def contacts_of(
     both = Correspondence(retargeting, source.space, motion, frames)
     space, names = source.space, source.domain_names
     surface, adjacent = _Samples.of(space), _adjacent(space)
-    by_patches = dict[tuple[int, int], _Found]()
+    # The central vertices of contacts, by the parts and the frame.
+    middles_of: dict[tuple[int, int], dict[int, tuple[int, int]]] = defaultdict(dict)
     heights, level = list[FloatArray](), list[FloatArray]()
     for frame in range(len(frames)):
         vertices = frames.space(frame, space).decode(frames.codes[frame][None])[0]
         heights.append(vertices @ space.up)
         level.append(vertices - heights[-1][:, None] * space.up)
         for parts, middles in surface.touching(vertices, adjacent):
-            contact = by_patches.setdefault(parts, _Found((names[parts[0]], names[parts[1]])))
-            contact.vertices[frame] = middles
+            middles_of[parts][frame] = middles
     touches: list[list[Touch]] = [[] for _ in range(len(frames))]
     contacts = list[tuple[str, str]]()
-    for contact in by_patches.values():
-        for run in runs(np.isin(np.arange(len(frames)), list(contact.vertices))):
-            sides = _sliding(both, [contact.vertices[frame] for frame in run])
+    for (first_part, second_part), by_frame in middles_of.items():
+        for run in runs(np.isin(np.arange(len(frames)), list(by_frame))):
+            sides = _sliding(both, [by_frame[frame] for frame in run])
             if sides is None:
                 continue
             for frame, (first, second) in zip(run, sides, strict=True):
                 touches[frame].append(Touch(len(contacts), first, second))
-            contacts.append(contact.name)
-    decoded = _Decoded(body.space, motion)
+            contacts.append((names[first_part], names[second_part]))
+
+    @cache
+    def decoded(frame: int) -> FloatArray:
+        frame_space = motion.space(frame, body.space)
+        vertices: FloatArray = frame_space.decode(motion.codes[frame][None])[0]
+        return vertices
+
     ground_of = list[float]()
     for name, patch, on_ground, still in _soles(
         source, both, np.array(heights), np.array(level), frames.rate
@@ -377,20 +369,6 @@ def _frames_at(motion: Motion, frames: npt.NDArray[np.intp]) -> Motion:
         hidden=None if hidden is None else lambda frame: hidden(int(frames[frame])),
         contacts=None,
     )
-
-
-class _Decoded:
-    """The vertices of a motion's frames, cached."""
-
-    def __init__(self, space: RigPoseSpace, motion: Motion) -> None:
-        self._space, self._motion = space, motion
-        self._kept = dict[int, FloatArray]()
-
-    def __call__(self, frame: int) -> FloatArray:
-        if frame not in self._kept:
-            codes = self._motion.codes[frame][None]
-            self._kept[frame] = self._motion.space(frame, self._space).decode(codes)[0]
-        return self._kept[frame]
 
 
 def _adjacent(space: RigPoseSpace) -> set[tuple[int, int]]:

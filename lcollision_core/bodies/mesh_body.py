@@ -148,11 +148,6 @@ class MeshBody(Body):
         return self.detector.body_size
 
     @property
-    def is_trained(self) -> bool:
-        """False: there is nothing to train."""
-        return False
-
-    @property
     def can_resolve(self) -> bool:
         """False: nothing moves the mesh."""
         return False

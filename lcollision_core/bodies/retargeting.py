@@ -49,6 +49,7 @@ from lcollision_core.files.motion.node_motion import (
     NodeMotion,
     motions_of_scene,
     nearest_axes,
+    relative_to_parents,
     rotations_of,
 )
 from lcollision_core.files.motion.smpl import is_smpl_motion, read_smpl_motion, skeleton_of_smpl
@@ -427,17 +428,6 @@ class _Moved:
             transforms[..., :3, 3] @ axes.T,
         )
 
-    def seen_from(self, parents: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Return the rotations and positions of the joints relative to their parents."""
-        turns, places = self.turns.copy(), self.places.copy()
-        for joint, parent in enumerate(parents):
-            if parent >= 0:
-                back = np.swapaxes(self.turns[:, parent], 1, 2)
-                turns[:, joint] = back @ turns[:, joint]
-                way = self.places[:, joint] - self.places[:, parent]
-                places[:, joint] = np.einsum("txy,ty->tx", back, way)
-        return turns, places
-
 
 def bvh_of(space: RigPoseSpace, transforms: FloatArray, frame_time: float) -> bytes:
     """Return a BVH file of a moving rig: y up, z to its front, in its own unit.
@@ -460,7 +450,7 @@ def bvh_of(space: RigPoseSpace, transforms: FloatArray, frame_time: float) -> by
             np.concatenate([still, moved.turns], axis=1),
             np.concatenate([np.zeros((len(transforms), 1, 3)), moved.places], axis=1),
         )
-    from_parents = moved.seen_from(parents.tolist())
+    from_parents = relative_to_parents(parents, moved.turns, moved.places)
     return bvh_bytes(names, parents, moved.rest, ends, *from_parents, frame_time)
 
 
@@ -523,7 +513,7 @@ def vrma_of(
     exported = _Moved(
         stood, moved.turns[:, joints] @ np.swapaxes(aligned, 1, 2), moved.places[:, joints]
     )
-    turns, places = exported.seen_from(parents)
+    turns, places = relative_to_parents(np.array(parents), exported.turns, exported.places)
     ground = np.array([0.0, float((character.rest_vertices @ space.up).min()), 0.0])
     metres = character.metres
     offsets = np.where(np.array(parents)[:, None] >= 0, stood - stood[parents], stood - ground)

@@ -34,7 +34,7 @@ from lcollision_core.bodies.names import (
     with_regions,
 )
 from lcollision_core.bodies.rig_poses import HumanDraws, StarterPose, random_codes, starter_poses
-from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
+from lcollision_core.bodies.rig_space import ROOT_CODES, SHIFTS, RigPoseSpace
 from lcollision_core.bodies.skeletons import ROLE_NAMES, joint_parts
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.contact.exclusions import near_pairs_estimate
@@ -400,9 +400,6 @@ _MOST_FRAMES, _MOST_RATE = 300, 10.0
 _SAME = 1e-5
 """Normalised tolerance within which rigs are the same."""
 
-_SHIFTS = 3
-"""The first codes shift the whole body, in normalised lengths; the others are angles."""
-
 _MOST_FREE = 32
 """Number of the character's poses, evenly spaced, that Resolve may start from."""
 
@@ -512,9 +509,8 @@ class RigBody(Body):
         """Return this body with the contact rules and body parts of a differently shaped one."""
         card, others_card = self.card, other.card
         if len(others_card.domain_names) == len(card.domain_names):
-            names, colours = others_card.domain_names, others_card.domain_colours
-            card = replace(card, domain_names=names, domain_colours=colours)
-            card = replace(card, domain_order=others_card.domain_order)
+            kept = ("domain_names", "domain_colours", "domain_order")
+            card = replace(card, **{name: getattr(others_card, name) for name in kept})
         body = self.with_card(card)
         if others_card.rules != card.rules:
             body = body.with_rules(others_card.rules)
@@ -575,16 +571,6 @@ class RigBody(Body):
         return joint_parts(self.character, self._space.anatomy)
 
     @property
-    def is_trained(self) -> bool:
-        """False: the joints come from the character's file."""
-        return False
-
-    @property
-    def can_resolve(self) -> bool:
-        """True: a rig can step from free poses towards the target."""
-        return True
-
-    @property
     def _no_predictor(self) -> tuple[str, str]:
         return f"the character {self.name!r} has no predictor", "train a model of its poses"
 
@@ -619,7 +605,7 @@ class RigBody(Body):
     def latent_space(self) -> LatentSpace:
         """The groups, names, colours and ranges of the codes; angles are displayed in degrees."""
         shapes = self.space.are_shapes
-        angles = (np.arange(self.latent_size) >= _SHIFTS) & ~shapes
+        angles = (np.arange(self.latent_size) >= SHIFTS) & ~shapes
         names = [
             WHOLE_BODY.lower() if joint < 0 else self.space.rig.joint_names[joint]
             for joint in self.space.joint_of_code.tolist()
@@ -677,18 +663,9 @@ class RigBody(Body):
         ------
         LCollisionError : the rig is not symmetric.
         """
-        sides, symmetry = self._sides, self.symmetry
-        if sides is None or symmetry is None:
-            raise self._not_mirrored()
-        return RigMirror(
-            self.attention_mask,
-            symmetry,
-            self.exact_check(),
-            self.nearest,
-            self.resolve,
-            self.space,
-            sides,
-        )
+        parts = self._mirror_parts()
+        assert self._sides is not None
+        return RigMirror(*parts, self.space, self._sides)
 
     @cached_property
     def code_effects(self) -> tuple[CodeEffect, ...]:

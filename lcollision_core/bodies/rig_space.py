@@ -31,7 +31,7 @@ _Influences = tuple[IntArray, IntArray, FloatArray, FloatArray]
 ROOT_CODES = 6
 """Codes of the whole body: its shift along left, up and front, and its turn about them."""
 
-_SHIFTS = 3
+SHIFTS = 3
 
 _SHIFT, _TURN = 1.0, np.pi
 """Bounds of the whole body's shift, normalised, and of its turn about an axis."""
@@ -477,7 +477,7 @@ class RigPoseSpace:
         others = _HELPING if whole_body else _RELUCTANT
         prices = np.where(self.limbs.codes_of(held), 1.0, others)
         prices[ROOT_CODES:] /= self.limbs.shares[self.limbs.owner[ROOT_CODES:]]
-        prices[:_SHIFTS], prices[_SHIFTS:ROOT_CODES] = 0.0, _WHOLE_TURN
+        prices[:SHIFTS], prices[SHIFTS:ROOT_CODES] = 0.0, _WHOLE_TURN
         return np.diag(_TURNED * prices)
 
     def _turns(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -700,7 +700,7 @@ class RigPoseSpace:
     def shifted(self, codes: FloatArray, way: FloatArray) -> FloatArray:
         """Move the whole body of (D,) codes by a (3,) normalised displacement."""
         moved: FloatArray = codes.copy()
-        moved[:_SHIFTS] += way @ self._body
+        moved[:SHIFTS] += way @ self._body
         return moved
 
     def transforms(self, codes: FloatArray) -> FloatArray:
@@ -793,8 +793,8 @@ class RigPoseSpace:
         Full turns added to the rotation vector of a ball joint give the same pose: choose those
         nearest to the frame before.
         """
-        joints = self.joint_of_code[_SHIFTS:]
-        turned = [_SHIFTS + np.flatnonzero(joints == joint) for joint in np.unique(joints)]
+        joints = self.joint_of_code[SHIFTS:]
+        turned = [SHIFTS + np.flatnonzero(joints == joint) for joint in np.unique(joints)]
         free = [codes_of_one for codes_of_one in turned if len(codes_of_one) == 3]
         free_codes = np.array(free, dtype=np.int64).reshape(-1, 3)
         unwound = codes.copy()

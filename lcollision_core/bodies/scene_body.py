@@ -30,7 +30,7 @@ from lcollision_core.bodies.scene_space import PlacedSpace, SceneSpace, StillSpa
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding.bilevel import LatentFit
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files.scene.appearance import Appearance, Material
+from lcollision_core.files.scene.appearance import Appearance, Material, join_appearances
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import FaceGroup, RigidTransform, Topology
 from lcollision_core.meshes.face_groups import MAX_GROUPS
@@ -428,16 +428,6 @@ class SceneBody(Body):
         return digest_of("scene " + "; ".join(members), arrays)[:16]
 
     @property
-    def is_trained(self) -> bool:
-        """False: the codes are those of the bodies."""
-        return False
-
-    @property
-    def can_resolve(self) -> bool:
-        """True: Resolve can step from poses with the bodies apart."""
-        return True
-
-    @property
     def _no_predictor(self) -> tuple[str, str]:
         return "a scene of several bodies has no predictor", "open one of them"
 
@@ -478,17 +468,12 @@ class SceneBody(Body):
         ------
         LCollisionError : several bodies are posed, or the body is not symmetric.
         """
-        only, symmetry = self.only_posed, self.symmetry
-        if only is None or symmetry is None:
-            raise self._not_mirrored()
+        parts, only = self._mirror_parts(), self.only_posed
+        assert only is not None
         at = self.standing.index(only)
         space = self._space
         return _MirrorOfOne(
-            self.attention_mask,
-            symmetry,
-            self.exact_check(),
-            self.nearest,
-            self.resolve,
+            *parts,
             only.body.pose_mirror,
             space.members[at],
             space.codes[at],
@@ -514,37 +499,13 @@ class SceneBody(Body):
     @cached_property
     def appearance(self) -> Appearance | None:
         """Appearance of the bodies; large textures take long to read."""
-        looks = [(member, member.body.appearance) for member in self.members]
-        if all(look is None for _, look in looks):
+        members = sorted(self.members, key=lambda member: self.vertices_of[member.name].start)
+        bodies = [member.body for member in members]
+        if all(body.appearance is None for body in bodies):
             return None
-        by_name = {member.name: look or _plain(member.body) for member, look in looks}
-        order = sorted(by_name, key=lambda name: self.vertices_of[name].start)
-        points, materials = 0, 0
-        parts: list[Appearance] = []
-        for name in order:
-            look = by_name[name]
-            parts.append(
-                replace(
-                    look,
-                    vertices=look.vertices + self.vertices_of[name].start,
-                    faces=look.faces + points,
-                    material_of=look.material_of + materials,
-                )
-            )
-            points, materials = points + len(look.vertices), materials + len(look.materials)
-
-        def together(name: str) -> npt.NDArray[Any]:
-            return np.concatenate([getattr(part, name) for part in parts])
-
-        return Appearance(
-            together("vertices"),
-            together("faces"),
-            together("uv"),
-            together("colours"),
-            together("material_of"),
-            tuple(chain.from_iterable(part.materials for part in parts)),
-            tuple(chain.from_iterable(part.notes for part in parts)),
-        )
+        looks = [body.appearance or _plain(body) for body in bodies]
+        counts = [body.n_vertices for body in bodies]
+        return join_appearances(looks, counts, np.arange(self.n_vertices))
 
     @cached_property
     def code_effects(self) -> tuple[CodeEffect, ...]:
@@ -675,12 +636,8 @@ class SceneBody(Body):
         poses = []
         for way in ways:
             shifts = _row([mesh @ way for mesh in meshes], movable, bodies)
-            poses.append(
-                self._space.moved_apart(
-                    latent,
-                    [shift * way + lift * up for shift, lift in zip(shifts, lifts, strict=True)],
-                )
-            )
+            moves = [shift * way + lift * up for shift, lift in zip(shifts, lifts, strict=True)]
+            poses.append(self._space.moved_apart(latent, moves))
         return poses
 
     @cached_property

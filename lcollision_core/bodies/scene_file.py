@@ -19,15 +19,13 @@ from lcollision_core.bodies.names import unique_names
 from lcollision_core.bodies.remembered import open_body, open_character
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember, ScenePart
-from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.files import Character, Rig, read_character, read_mesh
-from lcollision_core.files.character import ClipFrames
 from lcollision_core.files.safe import atomic_write, read_regular
 from lcollision_core.files.table import READABLE_SUFFIXES, SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.json_values import from_json, parse_document, parse_json
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.extents import guess_up
-from lcollision_core.meshes.topology import FloatArray
 
 SCENE_FORMAT, _VERSION = "lcollision-scene", 1
 _MAX_BYTES = 10_000_000
@@ -294,24 +292,9 @@ def open_member(source: str) -> Body:
 def _character_of_mesh(path: Path) -> Character:
     mesh = read_mesh(path)
     guess = guess_up(mesh.topology, mesh.vertices[None])
-
-    def sample(clip: str, _: float | FloatArray | None) -> ClipFrames:
-        raise MeshFileError(f"has no animation {clip!r}", "name a motion", where=path)
-
-    return Character(
-        path.stem,
-        path,
-        mesh.topology,
-        np.array(mesh.vertices),
-        np.arange(mesh.topology.n_vertices),
-        np.eye(3)[guess.axis if guess.is_sure else 1],
-        guess.is_sure,
-        1.0,
-        (),
-        None,
-        {},
-        sample,
-        mesh.notes,
+    up, vertices = np.eye(3)[guess.axis if guess.is_sure else 1], np.array(mesh.vertices)
+    return Character.without_clips(
+        path, mesh.topology, vertices, up, None, up_is_sure=guess.is_sure, notes=mesh.notes
     )
 
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.skeletons import anatomy_of, joint_roles, limb_children, rig_of
-from lcollision_core.files.character import Character, ClipFrames, Rig
+from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.motion.node_motion import least_turns
 from lcollision_core.meshes.joint_kinds import Role, Side, part_names
 from lcollision_core.meshes.topology import FloatArray, Topology
@@ -388,20 +388,8 @@ def stick_figure(motion: SkeletonMotion, rest: FloatArray, up: FloatArray) -> Ch
         np.ones((len(vertices), 1)),
         vertices[:, None],
     )
-    return Character(
-        "",
-        Path(),
-        Topology([[0, 1, 2]], len(vertices)),
-        vertices,
-        np.arange(len(vertices)),
-        up,
-        True,
-        1.0,
-        (),
-        rig,
-        {},
-        lambda *_: ClipFrames("", (), np.empty(0), None, lambda: np.empty((0, 0, 3))),
-    )
+    topology = Topology([[0, 1, 2]], len(vertices))
+    return Character.without_clips(Path(), topology, vertices, up, rig)
 
 
 def least_turn(way: FloatArray, other: FloatArray) -> FloatArray:
