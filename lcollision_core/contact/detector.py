@@ -226,6 +226,7 @@ class CollisionDetector:
         self._idle: queue.LifoQueue[Searcher] = queue.LifoQueue()
         self._gpu: GpuSearch | None = None
         self._nearness: ClearanceRule | None = None
+        self._last_nearness: tuple[tuple[float, bool], ClearanceRule | None] = (0.0, False), None
         self._may_touch: TouchingGroups = ()
         self._path: LinearPath | None = None
 
@@ -265,14 +266,20 @@ class CollisionDetector:
         return other
 
     def _near(self, clearance: float, rest_is_known: bool) -> ClearanceRule:
-        return nearness_of(
-            clearance,
-            self.topology,
-            self.reference,
-            self.body_size,
-            self._may_touch,
-            rest_is_known=rest_is_known,
-        )
+        wanted = clearance, rest_is_known
+        made_for, rule = self._last_nearness
+        if made_for != wanted or rule is None:
+            rule = nearness_of(
+                clearance,
+                self.topology,
+                self.reference,
+                self.body_size,
+                self._may_touch,
+                rest_is_known=rest_is_known,
+            )
+            # Kept, as the frames of a motion ask for the same distance in turn.
+            self._last_nearness = wanted, rule
+        return rule
 
     def without(self, faces: npt.NDArray[np.integer]) -> CollisionDetector:
         """Return a detector whose searches leave out some faces."""
@@ -291,6 +298,7 @@ class CollisionDetector:
         """Return a detector whose clearances let faces of two groups come to distance 0."""
         other = copy(self)
         other._may_touch, other._nearness = tuple(pairs), None
+        other._last_nearness = (0.0, False), None
         return other
 
     def with_rules(

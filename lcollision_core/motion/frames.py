@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact import NearestPair, SelfCollisions
-from lcollision_core.devices import block_size
+from lcollision_core.devices import block_size, uses_gpu
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes.contact_rules import ExcludedPairs, RuleCounts
 from lcollision_core.meshes.topology import FloatArray
@@ -35,6 +35,10 @@ _BLOCK = 8
 """Frames that a thread checks in one go."""
 
 _Frames = TypeVar("_Frames", bound=Sequence[int])
+
+
+_Verdicts = tuple[npt.NDArray[np.bool_], npt.NDArray[np.floating] | None]
+"""(n,) whether each of n frames collides, and maybe their (n, V, 3) vertices."""
 
 
 def _blocks(frames: _Frames, size: int) -> list[_Frames]:
@@ -415,7 +419,7 @@ def screen_frames(
     touches: Callable[[npt.NDArray[np.floating], npt.NDArray[np.floating]], bool] | None = None,
     estimated_free: npt.NDArray[np.bool_] | None = None,
     seen: Callable[[range], ExactCheck] | None = None,
-    collide: Callable[[Sequence[int], float], npt.NDArray[np.bool_]] | None = None,
+    collide: Callable[[Sequence[int], float], _Verdicts] | None = None,
     *,
     counted_only: bool = True,
 ) -> ScreenedMotion:
@@ -437,7 +441,7 @@ def screen_frames(
     seen : returns the check of one frame, or of two and the poses between, which replaces `find`,
         `measure` and `touches` if frames hide faces
     collide : returns which of several frames, or of poses a share of the way to the next, collide,
-        faster than `find`; thread-safe
+        faster than `find`, and maybe their vertices; thread-safe
     counted_only : whether to leave out the pairs that the contact rules exclude; if not, they are
         looked for in every n-th frame: see `ExcludedPairs.step_for`
 
@@ -456,14 +460,17 @@ def screen_frames(
     def screened_block(frames: range) -> list[FrameCollisions | None]:
         left = [at for at in frames if estimated_free is None or not estimated_free[at]]
         frames_to_measure = [at for at in left if not is_searched(at)] if measure is None else []
+        posed: dict[int, npt.NDArray[np.floating]] = {}
         if collide is not None and frames_to_measure:
-            free = set(np.compress(~collide(frames_to_measure, 0.0), frames_to_measure).tolist())
+            collides, meshes = collide(frames_to_measure, 0.0)
+            free = set(np.compress(~collides, frames_to_measure).tolist())
             left = [at for at in left if at not in free]
-        return [screened(at) if at in left else None for at in frames]
+            posed = {} if meshes is None else dict(zip(frames_to_measure, meshes, strict=True))
+        return [screened(at, posed.get(at)) if at in left else None for at in frames]
 
-    def screened(frame: int) -> FrameCollisions | None:
+    def screened(frame: int, vertices: npt.NDArray[np.floating] | None) -> FrameCollisions | None:
         job.check()
-        vertices = mesh(frame, 0.0)
+        vertices = mesh(frame, 0.0) if vertices is None else vertices
         frame_vertices = None if seen is None else seen(range(frame, frame + 1))
         collisions = (find if frame_vertices is None else frame_vertices.find)(
             vertices, counted_only=not is_searched(frame)
@@ -491,7 +498,7 @@ def screen_frames(
     def collides_after(frames: Sequence[int]) -> list[int]:
         job.check()
         if collide is not None:
-            hits = [np.compress(collide(frames, share), frames) for share in shares if len(frames)]
+            hits = [np.compress(collide(frames, at)[0], frames) for at in shares if len(frames)]
             return sorted({int(frame) for some in hits for frame in some})
         return [frame for frame in frames if one_collides_after(frame)]
 
@@ -561,9 +568,13 @@ def screen_motion(
     MissingExtraError : ipctk is not installed, which `continuous` needs.
     """
     space = check.space
+    unplaced = check if motion.placements is not None else replace(check, placement=None)
 
-    def collide(frames: Sequence[int], share: float) -> npt.NDArray[np.bool_]:
-        return motion.collide(frames, check, share)
+    def collide(frames: Sequence[int], share: float) -> _Verdicts:
+        if share or uses_gpu(len(frames), space.topology.n_faces):
+            return motion.collide(frames, check, share), None
+        meshes = motion.meshes(frames, check)
+        return ~unplaced.are_free_meshes(meshes), meshes
 
     return screen_frames(
         lambda frame, share: motion.vertices(frame, check, share),

@@ -237,20 +237,29 @@ class Motion:
         check : of their vertices
         share : as for `vertices`
         """
+        if self.space_at is None and self.placements is None:
+            return ~replace(check, placement=None).are_free(self._codes_at(frames, share))
+        return ~check.are_free_meshes(self.meshes(frames, check, share))
+
+    def meshes(
+        self, frames: Sequence[int], check: ExactCheck, share: float = 0.0
+    ) -> npt.NDArray[np.floating]:
+        """Return (n, V, 3) exported vertices; parameters are those of `collide`."""
         if self.space_at is not None or (share and self.placements is not None):
-            meshes = np.stack([self.vertices(frame, check, share) for frame in frames])
-            return ~check.are_free_meshes(meshes)
+            return np.stack([self.vertices(frame, check, share) for frame in frames])
+        decoded = check.decode(self._codes_at(frames, share))
+        if self.placements is None:
+            return replace(check, placement=None).exported(decoded)
+        placed = [replace(check, placement=self.placement(frame)) for frame in frames]
+        return np.stack(
+            [frame_check.exported(own) for frame_check, own in zip(placed, decoded, strict=True)]
+        )
+
+    def _codes_at(self, frames: Sequence[int], share: float) -> FloatArray:
         codes = self.codes[frames]
         if share:
             codes = (1.0 - share) * codes + share * self.codes[np.add(frames, 1)]
-        if self.placements is None:
-            return ~replace(check, placement=None).are_free(codes)
-        placed = [replace(check, placement=self.placement(frame)) for frame in frames]
-        decoded = check.decode(codes)
-        meshes = np.stack(
-            [frame_check.exported(own) for frame_check, own in zip(placed, decoded, strict=True)]
-        )
-        return ~check.are_free_meshes(meshes)
+        return codes
 
 
 def corrected(motion: Motion, frame: int, codes: npt.ArrayLike, easing: int) -> Motion:

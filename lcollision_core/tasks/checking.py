@@ -344,9 +344,9 @@ def _check_meshes(path: Path, request: CheckRequest, job: Job) -> list[CheckedCl
 
 def _collide(
     body: MeshBody, detector: CollisionDetector, frames: Sequence[int], share: float
-) -> npt.NDArray[np.bool_]:
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.floating]]:
     meshes = np.stack([body.vertices_at(frame, share) for frame in frames])
-    return detector.are_colliding(meshes, workers=1)
+    return detector.are_colliding(meshes, workers=1), meshes
 
 
 def _verdict(
