@@ -23,7 +23,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from app.benchmarks.timing import Row
+from app.benchmarks.measures import Row
 from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.kept_contacts import contacts_of
 from lcollision_core.bodies.motions import read_motions

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
+from app.benchmarks.measures import Row
 from app.benchmarks.motion import motions_of
-from app.benchmarks.timing import Row
 from lcollision_core.bodies import Body, LearnedBody
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.labels import Labeller

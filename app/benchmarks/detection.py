@@ -30,7 +30,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from app.benchmarks.timing import Row
+from app.benchmarks.measures import Row
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.files import PoseSet
 from lcollision_core.jobs import UNWATCHED, Job

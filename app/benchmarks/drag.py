@@ -35,8 +35,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csgraph
 
-from app.benchmarks.brute_force import is_free_by_brute_force
-from app.benchmarks.timing import Row
+from app.benchmarks.measures import Row, is_free_by_brute_force
 from lcollision_core.bodies import Body
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import LCollisionError

@@ -48,7 +48,7 @@ import rich  # noqa: F401 - loaded by the command before, like the next line
 import typer  # noqa: F401
 from PySide6.QtCore import QEventLoop, QObject, QTimer, Slot
 
-from app.benchmarks.timing import Row, median_seconds
+from app.benchmarks.measures import Row, median_seconds
 from app.editing.document import PoseDocument
 from app.editing.live_pose import training_pose
 from app.editing.settings import Settings

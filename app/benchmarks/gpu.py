@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from app.benchmarks.timing import Row, median_seconds
+from app.benchmarks.measures import Row, median_seconds
 from lcollision_core.bodies import Body, LearnedBody
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.contact.kernels import COUNTED

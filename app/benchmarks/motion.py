@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from app.benchmarks.brute_force import is_free_by_brute_force
-from app.benchmarks.timing import Row
+from app.benchmarks.measures import Row, is_free_by_brute_force
 from lcollision_core.bodies import Body
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.jobs import UNWATCHED, Job

@@ -42,7 +42,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.benchmarks.detection import contacts_of_fcl, missing_peers
-from app.benchmarks.timing import Row, median_seconds
+from app.benchmarks.measures import Row, median_seconds
 from lcollision_core.bodies import LearnedBody, check_poses
 from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.jobs import UNWATCHED, Job, available_cores

@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull
 
-from app.benchmarks.timing import Row
+from app.benchmarks.measures import Row
 from lcollision_core.bodies import NamedPose, open_body, sample_poses
 from lcollision_core.contact import solids
 from lcollision_core.errors import LCollisionError

@@ -24,7 +24,7 @@ from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
-    from app.benchmarks.timing import Row
+    from app.benchmarks.measures import Row
     from lcollision_core.bodies import Body
 
 app = typer.Typer(help="Measure what docs/results.md quotes.", no_args_is_help=True)
@@ -150,8 +150,8 @@ def resolve(
     as_json: JsonOption = False,
 ) -> None:
     """Compare the solvers, and a bisection that uses nothing learned, on colliding poses."""
-    from app.benchmarks.histograms import draw_histograms
     from app.benchmarks.resolve import (
+        draw_histograms,
         made_poses,
         real_poses,
         sampled_poses,

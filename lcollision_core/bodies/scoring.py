@@ -24,7 +24,7 @@ from lcollision_core.meshes.contact_rules import MAX_TOUCHING, TOUCHING_RADIUS
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.options import ResolveOptions
-from lcollision_core.posing.gpu_check import colliding_on_gpu
+from lcollision_core.posing.exact import colliding_on_gpu
 from lcollision_core.predictor import KindScores
 
 if TYPE_CHECKING:

@@ -6,7 +6,6 @@ coincide exactly have depth 0: they touch, and do not collide. `CollisionDetecto
 them. With a clearance, triangles nearer than it collide: see `CollisionDetector.with_clearance`.
 """
 
-from lcollision_core.contact.clearance import DISTANCE_BOUND, NearestPair
 from lcollision_core.contact.depth import depth_slopes, penetration_depth
 from lcollision_core.contact.detector import (
     BatchCollisions,
@@ -14,6 +13,7 @@ from lcollision_core.contact.detector import (
     SelfCollisions,
 )
 from lcollision_core.contact.distance import distance_slopes, triangle_distance
+from lcollision_core.contact.exclusions import DISTANCE_BOUND, NearestPair
 from lcollision_core.contact.propose import (
     GroupPair,
     ProposedPair,

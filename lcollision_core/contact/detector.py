@@ -20,16 +20,14 @@ from lcollision_core.contact.arrays import (
     FaceTree,
     SkippableNodes,
 )
-from lcollision_core.contact.clearance import (
-    NearestPair,
-    TouchingGroups,
-    nearness_of,
-    require_clearance,
-)
 from lcollision_core.contact.continuous import LinearPath
 from lcollision_core.contact.distance import triangle_distance
 from lcollision_core.contact.exclusions import (
+    NearestPair,
+    TouchingGroups,
     exclusions_of,
+    nearness_of,
+    require_clearance,
     require_listable,
     rules_of,
     with_other_rules,

@@ -28,7 +28,7 @@ class PredictorConfig:
 
     Attributes
     ----------
-    preset : name of the network, see `presets.NETWORKS`
+    preset : name of the network, of `PRESETS`
     by_domain : whether there is a predictor for each domain; False is the paper's baseline ND
     depth_weight, rank_weight, entropy_weight : of L_PD, L_rank, L_entropy; the entropy's is above
         0; the default preset has its own losses, without ranking

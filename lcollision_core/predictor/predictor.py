@@ -342,10 +342,8 @@ class CollisionPredictor:
         """Return a new torch network in single precision on the CPU, with fixed weights."""
         import torch
 
-        from lcollision_core.predictor.networks import NETWORKS
-
         state = {name: torch.tensor(array) for name, array in self.arrays.items()}
-        network = NETWORKS[self.config.preset].restore(self.embedding, self.config, state)
+        network = network_of(self.config.preset).restore(self.embedding, self.config, state)
         return network.requires_grad_(False).eval()
 
     @cached_property
@@ -368,6 +366,17 @@ class CollisionPredictor:
         if not np.isfinite(codes).all():
             raise ShapeError("a latent pose contains NaN or infinity")
         return codes
+
+
+def network_of(preset: str) -> type[PredictorNetwork]:
+    """Return the class of a preset's network, which needs torch."""
+    if preset == "paper":
+        from lcollision_core.predictor.paper_network import PaperNetwork
+
+        return PaperNetwork
+    from lcollision_core.predictor.geometric_network import GeometricNetwork
+
+    return GeometricNetwork
 
 
 def require_model(rows: LabelRows, embedding: Embedding) -> None:

@@ -35,8 +35,7 @@ from lcollision_core.predictor.config import (
 from lcollision_core.predictor.geometric_network import FoldDetector
 from lcollision_core.predictor.metrics import error_rates
 from lcollision_core.predictor.network_base import PredictorNetwork, SkinCells, Targets
-from lcollision_core.predictor.networks import NETWORKS
-from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
+from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts, network_of
 
 
 @dataclass(frozen=True)
@@ -307,7 +306,7 @@ class TrainingLoop:
         key = self._key()
         checkpoint = Checkpoint(self.checkpoint, key)
         some = self.rows.taken(self._training_index[:_BUILDING_ROWS])
-        network = NETWORKS[config.preset].build(
+        network = network_of(config.preset).build(
             self.embedding, config, some, self.facts.seed, self._rules, self.groups
         )
         network = network.to(processes.device)

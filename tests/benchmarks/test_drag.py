@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.benchmarks.brute_force import is_free_by_brute_force, least_by_brute_force
+from app.benchmarks.measures import is_free_by_brute_force, least_by_brute_force
 from lcollision_core.bodies import LearnedBody, sample_poses
 from tests.app.support import Lcollision
 from tests.rigged_shapes import rigged_body, write_gltf

@@ -15,7 +15,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QDialog, QMessageBox
 from pytestqt.qtbot import QtBot
 
-from app.benchmarks.brute_force import is_free_by_brute_force
+from app.benchmarks.measures import is_free_by_brute_force
 from app.view.camera import View, sees_all
 from app.view.offscreen import MotionVideo, VideoStyle
 from app.view.shading import Shading

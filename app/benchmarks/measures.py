@@ -1,8 +1,11 @@
-"""Confirmation of the exact check by all pairs of faces of a pose, without a tree."""
+"""What benchmarks share: rows, times, and verdicts by all pairs of faces, without a tree."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import statistics
+import time
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,9 +14,22 @@ from lcollision_core.bodies import Body
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth, triangle_distance
 from lcollision_core.contact.distance import REST_SHARE
 
+Row = dict[str, Any]
+"""One row of a benchmark, as printed and as written to JSON."""
+
 Pairs = npt.NDArray[np.int64]
 
 _ROWS_AT_ONCE = 256
+
+
+def median_seconds(calls: Iterable[Callable[[], object]]) -> float:
+    """Return the median duration of some calls, made one after the other."""
+    seconds = []
+    for call in calls:
+        began = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - began)
+    return statistics.median(seconds)
 
 
 def is_free_by_brute_force(model: Body, vertices: npt.NDArray[np.floating]) -> bool:
