@@ -276,7 +276,8 @@ def test_a_long_motion_killed_twice_goes_on_from_its_last_span(
     assert not kept.exists()
 
 
-@pytest.mark.parametrize("kind", ["bvh", pytest.param("vrma", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["bvh", "vrma"])
 def test_a_clip_comes_back_free_as_the_motion_of_a_skeleton(
     lcollision: Lcollision, tmp_path: Path, kind: str
 ) -> None:

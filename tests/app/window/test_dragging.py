@@ -322,6 +322,7 @@ def test_feet_stay_and_the_whole_body_helps_as_the_menu_says(window: MainWindow)
     document.motion.cancel_drag()
 
 
+@pytest.mark.slow
 def test_a_drag_hints_at_what_else_can_be_done_and_says_that_the_body_helps(
     qtbot: QtBot, window: MainWindow
 ) -> None:

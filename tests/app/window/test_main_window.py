@@ -240,6 +240,7 @@ def words_on_the_screen(window: MainWindow) -> Iterator[str]:
     yield from (legend.title, legend.note, legend.crossing)
 
 
+@pytest.mark.slow
 def test_nothing_on_the_screen_speaks_of_the_mathematics(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:

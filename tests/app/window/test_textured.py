@@ -74,6 +74,7 @@ def test_a_character_opens_as_it_looks_and_others_as_before(
     assert window.settings["shading"] == "domains"
 
 
+@pytest.mark.slow
 def test_a_shading_that_was_chosen_is_what_the_next_character_opens_with(
     qtbot: QtBot, window: MainWindow, cube_file: Path, tmp_path: Path
 ) -> None:

@@ -377,6 +377,7 @@ def test_a_dropped_clip_without_a_mesh_goes_to_the_timeline_and_into_the_file(
     assert len(read_motions(document.model, path)[0]) == N_FRAMES
 
 
+@pytest.mark.slow
 def test_the_box_of_motions_is_as_wide_as_their_names(qtbot: QtBot, swinging: MainWindow) -> None:
     timeline, box = swinging.document.timeline, swinging.timeline.clips
     name = "a walk with a long name"
@@ -426,6 +427,7 @@ def test_what_is_shown_as_it_was_has_its_own_verdict_and_pairs(
     assert not painted(swinging, worst - 1)[0]
 
 
+@pytest.mark.slow
 def test_what_resolve_found_is_not_shown_beside_a_frame_as_it_was(
     qtbot: QtBot, swinging: MainWindow
 ) -> None:
@@ -581,6 +583,7 @@ def test_a_video_of_the_motion_has_its_frames(
     assert (first != middle).any()
 
 
+@pytest.mark.slow
 def test_a_video_shows_what_codes_do_not_hold_of_its_frames(
     swinging: MainWindow, tmp_path: Path
 ) -> None:
@@ -604,6 +607,7 @@ def test_a_video_shows_what_codes_do_not_hold_of_its_frames(
         video.close()
 
 
+@pytest.mark.slow
 def test_the_path_of_a_point_goes_with_its_motion_and_stays_with_new_names(
     qtbot: QtBot, swinging: MainWindow
 ) -> None:
@@ -707,6 +711,7 @@ def test_a_dropped_motion_does_not_replace_an_edited_one_unasked(
     assert timeline.are_saved()
 
 
+@pytest.mark.slow
 def test_a_pose_is_asked_about_before_the_timeline_takes_its_place(
     swinging: MainWindow, tmp_path: Path
 ) -> None:

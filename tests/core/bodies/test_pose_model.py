@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -224,20 +222,6 @@ def test_file_holds_all_that_a_front_end_needs(model: LearnedBody, path: Path) -
     again = path.with_name("again.safetensors")
     loaded.save(again)
     assert again.read_bytes() == path.read_bytes()
-
-
-def test_loading_and_decoding_need_no_torch_and_no_front_end(path: Path) -> None:
-    code = (
-        "import sys, numpy; from lcollision_core.bodies import LearnedBody; "
-        f"m = LearnedBody.load({str(path)!r}); m.encode(m.decode(numpy.zeros(m.latent_size))); "
-        "print(*{name.partition('.')[0] for name in sys.modules})"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    loaded = set(result.stdout.split())
-    assert "lcollision_core" in loaded
-    assert loaded & {"torch", "PySide6", "vtkmodules", "pyvista", "typer", "rich"} == set()
 
 
 def test_renaming_is_kept_and_leaves_the_latent_space_alone(model: LearnedBody, path: Path) -> None:

@@ -216,6 +216,7 @@ def test_a_run_that_is_to_end_keeps_the_spans_that_are_done() -> None:
     assert found.after.tolist() == [bool(free) for free in check.are_free(codes)]
 
 
+@pytest.mark.slow
 def test_a_run_that_is_to_end_keeps_the_windows_that_are_done(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -325,36 +325,41 @@ def test_a_resolved_motion_changes_its_spans_alone_and_is_free(
     assert len(joints) > 0
 
 
+@pytest.mark.variants
+@pytest.mark.parametrize(
+    ("kind", "pose"),
+    [
+        ("resolve_pose", {"transforms": TRANSFORMS[20]}),
+        ("resolve_motion", {"transforms": TRANSFORMS, "times": TIMES}),
+    ],
+    ids=["pose", "motion"],
+)
 def test_joints_that_hardly_turn_stay_where_that_makes_nothing_worse(
-    engine: Engine, opened: Reply
+    engine: Engine, opened: Reply, kind: str, pose: dict[str, Any]
 ) -> None:
     asked = {"character": opened["character"], "keep_feet": False}
     least = 3e-3
-    for kind, pose in (
-        ("resolve_pose", {"transforms": TRANSFORMS[20]}),
-        ("resolve_motion", {"transforms": TRANSFORMS, "times": TIMES}),
-    ):
-        every = engine.ask(kind, **asked, **pose)
-        fewer = engine.ask(kind, **asked, **pose, least_change=least)
-        joints = [set(array(one["joints"]).tolist()) for one in (every, fewer)]
-        assert joints[1] < joints[0]
-        if kind == "resolve_pose":
-            assert fewer["free"]
-            frames = [(TRANSFORMS[20], every, fewer)]
-        else:
-            assert fewer["free_after"] == every["free_after"] == len(TIMES)
-            assert fewer["spans"] == every["spans"]
-            numbers = [frame for span in every["spans"] for frame in range(*span)]
-            frames = [
-                (
-                    TRANSFORMS[frame],
-                    *({**one, "turns": of_frame(one, row)} for one in (every, fewer)),
-                )
-                for row, frame in enumerate(numbers)
-            ]
-        for before, one, other in frames:
-            off = np.linalg.norm(moved(before, one) - moved(before, other), axis=1).max()
-            assert off <= 1.001 * least * opened["body_size"]
+    every = engine.ask(kind, **asked, **pose)
+    fewer = engine.ask(kind, **asked, **pose, least_change=least)
+    joints = [set(array(one["joints"]).tolist()) for one in (every, fewer)]
+    assert joints[1] < joints[0]
+    if kind == "resolve_pose":
+        assert fewer["free"]
+        frames = [(TRANSFORMS[20], every, fewer)]
+    else:
+        assert fewer["free_after"] == every["free_after"] == len(TIMES)
+        assert fewer["spans"] == every["spans"]
+        numbers = [frame for span in every["spans"] for frame in range(*span)]
+        frames = [
+            (
+                TRANSFORMS[frame],
+                *({**one, "turns": of_frame(one, row)} for one in (every, fewer)),
+            )
+            for row, frame in enumerate(numbers)
+        ]
+    for before, one, other in frames:
+        off = np.linalg.norm(moved(before, one) - moved(before, other), axis=1).max()
+        assert off <= 1.001 * least * opened["body_size"]
 
 
 def of_frame(reply: Reply, row: int) -> Any:

@@ -183,6 +183,7 @@ def test_names_that_cannot_be_are_said_and_stay_to_be_put_right(own: MainWindow)
     assert not own.document.tasks.busy
 
 
+@pytest.mark.slow
 def test_another_model_that_comes_in_takes_the_dialog_of_this_one_away(own: MainWindow) -> None:
     dialog = dialog_of(own)
     type_name(dialog, "knee")
@@ -199,6 +200,7 @@ def test_what_another_command_wrote_meanwhile_stays(qtbot: QtBot, own: MainWindo
     assert document.model.domain_names == ("knee", "told elsewhere")
 
 
+@pytest.mark.slow
 def test_a_file_that_holds_another_model_by_now_is_left_alone(
     qtbot: QtBot, own: MainWindow
 ) -> None:

@@ -193,6 +193,7 @@ def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: 
     take_picture(window, "left-out")
 
 
+@pytest.mark.slow
 def test_meshes_and_materials_have_a_list_each_in_a_dialog_that_widens(
     qtbot: QtBot, window: MainWindow, body: RigBody
 ) -> None:

@@ -185,6 +185,12 @@ def lowered(body: Body) -> npt.NDArray[np.float64]:
 def test_the_ground_counts_where_it_is_wanted(qtbot: QtBot, hero: Path, tmp_path: Path) -> None:
     window = open_window(qtbot, PoseDocument(open_body(hero)), settings_in(tmp_path))
     document, toggle = window.document, window.actions_by_key["ground"]
+    # One body has no list.
+    assert window.docks["bodies"].isHidden()
+    assert offers_to_learn(window) == [True]
+    assert not window.docks["bodies"].toggleViewAction().isVisible()
+    window.reset_layout()
+    assert window.docks["bodies"].isHidden()
     sunk = lowered(document.model)
     document.motion.set_code(int(np.flatnonzero(sunk)[0]), float(sunk[sunk != 0.0][0]))
     assert document.model.exact_check().is_free(sunk)
@@ -210,16 +216,6 @@ def test_the_ground_counts_where_it_is_wanted(qtbot: QtBot, hero: Path, tmp_path
         toggle.trigger()
     assert as_scene(document.model) is None
     np.testing.assert_array_equal(document.history.latent, sunk)
-    close_window(window)
-
-
-def test_one_body_has_no_list(qtbot: QtBot, hero: Path, tmp_path: Path) -> None:
-    window: MainWindow = open_window(qtbot, PoseDocument(open_body(hero)), settings_in(tmp_path))
-    assert window.docks["bodies"].isHidden()
-    assert offers_to_learn(window) == [True]
-    assert not window.docks["bodies"].toggleViewAction().isVisible()
-    window.reset_layout()
-    assert window.docks["bodies"].isHidden()
     close_window(window)
 
 

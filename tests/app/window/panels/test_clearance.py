@@ -48,6 +48,7 @@ def resolved(qtbot: QtBot, window: MainWindow) -> ResolveResult:
     return result
 
 
+@pytest.mark.slow
 def test_the_field_says_the_clearance_and_the_next_window_has_it(
     qtbot: QtBot, body: LearnedBody, tmp_path: Path
 ) -> None:

@@ -48,6 +48,7 @@ def is_seen_whole(window: MainWindow, widget: QWidget) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_the_result_of_resolve_scrolls_into_sight(
     qtbot: QtBot, window: MainWindow, colliding: FloatArray
 ) -> None:
@@ -60,6 +61,7 @@ def test_the_result_of_resolve_scrolls_into_sight(
     qtbot.waitUntil(lambda: is_seen_whole(window, window.collision.outcome), timeout=PATIENCE)
 
 
+@pytest.mark.slow
 def test_the_panel_keeps_the_width_that_its_cards_need_also_where_settings_say_less(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -130,6 +132,7 @@ def test_the_estimate_steps_back_once_the_check_has_spoken(
     assert headline.mapTo(window, QPoint(0, 0)).y() < card.mapTo(window, QPoint(0, 0)).y()
 
 
+@pytest.mark.slow
 def test_the_headline_stays_in_sight_below_which_the_panel_scrolls(
     qtbot: QtBot, window: MainWindow, colliding: FloatArray
 ) -> None:
@@ -145,6 +148,7 @@ def test_the_headline_stays_in_sight_below_which_the_panel_scrolls(
     assert headline.visibleRegion().boundingRect() == headline.rect()
 
 
+@pytest.mark.slow
 def test_the_headline_keeps_what_it_says_and_its_height_until_the_next_check(
     qtbot: QtBot, window: MainWindow, colliding: FloatArray
 ) -> None:

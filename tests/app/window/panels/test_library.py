@@ -306,6 +306,7 @@ def test_the_browser_has_as_many_rows_as_there_is_room(qtbot: QtBot, window: Mai
     qtbot.waitUntil(lambda: rows_in_sight(window) >= 3, timeout=PATIENCE)
 
 
+@pytest.mark.slow
 def test_a_tall_window_begins_with_two_rows(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:

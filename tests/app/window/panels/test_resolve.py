@@ -92,6 +92,7 @@ def test_the_largest_change_is_kept_and_what_is_left_is_said(
     assert resolve(qtbot, window).exactly_free
 
 
+@pytest.mark.slow
 def test_a_search_that_had_no_time_is_not_called_needless(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
@@ -106,6 +107,7 @@ def test_a_search_that_had_no_time_is_not_called_needless(
         assert "No search: the time limit came first" in texts(card)
 
 
+@pytest.mark.slow
 def test_the_time_told_is_what_was_waited_as_well(
     qtbot: QtBot,
     window: MainWindow,

@@ -154,6 +154,7 @@ def test_the_poses_of_a_file_that_is_opened_are_shown_beside_the_library(
     assert not library.of_file.isVisible()
 
 
+@pytest.mark.slow
 @pytest.mark.own_window
 def test_pictures_that_were_due_while_the_library_was_hidden_are_drawn_when_it_is_seen(
     qtbot: QtBot, window: MainWindow
@@ -168,6 +169,7 @@ def test_pictures_that_were_due_while_the_library_was_hidden_are_drawn_when_it_i
     qtbot.waitUntil(lambda: is_drawn(items[0].icon()), timeout=PATIENCE)
 
 
+@pytest.mark.slow
 @pytest.mark.own_window
 def test_pictures_of_poses_that_are_not_searched_for_are_not_seen(
     qtbot: QtBot, window: MainWindow
@@ -293,6 +295,7 @@ def name_label(row: QWidget) -> QLabel:
     return next(label for label in row.findChildren(QLabel) if label.text())
 
 
+@pytest.mark.slow
 def test_a_name_is_whole_where_there_is_room_and_its_tool_tip_is_where_not(
     qtbot: QtBot, editor_model: LearnedBody, tmp_path: Path
 ) -> None:
