@@ -33,7 +33,7 @@ from tests.app.support import Lcollision, refusal
 from tests.bending_tube import bending_tube
 from tests.core.killed import after_checkpoint
 
-N_ROWS = 2000
+N_ROWS = 1000
 SECONDS_TO_WAIT = 600.0
 
 
@@ -59,21 +59,28 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def store(model: Path) -> Path:
+def n_rows(request: pytest.FixtureRequest) -> int:
+    """Return the number of labelled samples: a test of quality asks for more."""
+    return int(getattr(request, "param", N_ROWS))
+
+
+@pytest.fixture(scope="module")
+def store(model: Path, n_rows: int) -> Path:
     """Return the model's labelled samples."""
-    path = model.with_name("store")
-    command = [sys.executable, "-m", "app", "label", model, "-n", str(N_ROWS), "-o", path]
+    path = model.with_name(f"store {n_rows}")
+    command = [sys.executable, "-m", "app", "label", model, "-n", str(n_rows), "-o", path]
     subprocess.run(command, check=True, capture_output=True)
     return path
 
 
 @pytest.fixture(scope="module")
-def trained(model: Path, store: Path) -> Path:
+def trained(model: Path, store: Path, n_rows: int) -> Path:
     """Return a model with the paper's predictor, trained by the command.
 
     How well such a small predictor ranks depends on its seed; with others, on the processor too.
     """
-    path = model.with_name("trained.safetensors")
+    path = store.with_name(f"of {n_rows}") / "trained.safetensors"
+    path.parent.mkdir()
     command = [sys.executable, "-m", "app", "train", "predictor", model, store, "-o", path]
     result = subprocess.run(
         [*command, "--preset", "paper", "--seed", "2"], check=True, capture_output=True, text=True
@@ -81,7 +88,7 @@ def trained(model: Path, store: Path) -> Path:
     assert result.stdout == ""
     said = _without_progress(result.stderr)
     assert said.startswith(f"lcollision: wrote {path}: ")
-    assert f" on {3 * N_ROWS // 10} unseen samples" in said
+    assert f" on {3 * n_rows // 10} unseen samples" in said
     assert not path.with_name("trained.safetensors.checkpoint").exists()
     return path
 
@@ -94,7 +101,17 @@ def _without_progress(said: str) -> str:
     )
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("n_rows", [2000], indirect=True)
 def test_a_trained_predictor_beats_the_majority_on_real_labels(
+    lcollision: Lcollision, trained: Path, store: Path
+) -> None:
+    report = json.loads(lcollision("evaluate", trained, store, "--kinds", 0, "--json").stdout)
+    assert report["accuracy"] > report["majority_rate"] + 0.03
+    assert report["spearman"] > 0.7
+
+
+def test_a_trained_predictor_is_measured_on_real_labels(
     lcollision: Lcollision, trained: Path, store: Path
 ) -> None:
     result = lcollision("evaluate", trained, store, "--kinds", 40, "--json")
@@ -141,8 +158,7 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
         "calibration_error",
     }
     assert report["samples"] == 3 * N_ROWS // 10
-    assert report["accuracy"] > report["majority_rate"] + 0.03
-    assert report["spearman"] > 0.7
+    assert report["accuracy"] > report["majority_rate"]
     assert sum(entry["samples"] for entry in curve) == report["samples"]
     # The file contains the figures that training measured on the held-out rows.
     predictor = LearnedBody.load(trained).predictor
