@@ -17,6 +17,7 @@ from lcollision_core.files.gltf.clips import ClipTracks, Track, driven_property
 from lcollision_core.files.gltf.schema import PARTS, GltfDocument, stored_parts
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene.scene import by_node
+from lcollision_core.files.scene.transforms import unit_quaternions
 from lcollision_core.files.scene_files import as_file_error, scene_of
 from lcollision_core.meshes.topology import FloatArray
 
@@ -124,7 +125,8 @@ def _change(file: CharacterFile, patch: GltfDocument, rig: Rig, change: ChangedC
             joint_turns = turns[rows, joint]
             if np.abs(joint_turns - np.eye(4)).max() <= _UNCHANGED:
                 continue
-            old, sizes = Rotation.from_quat(rotation.at(at)[:, 0]), scale.at(at)[:, 0]
+            old = Rotation.from_quat(unit_quaternions(rotation.at(at)[:, 0]))
+            sizes = scale.at(at)[:, 0]
             turned = (
                 old * Rotation.from_matrix(_unscaled(joint_turns[:, :3, :3], sizes))
             ).as_quat()

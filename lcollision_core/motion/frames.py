@@ -626,7 +626,7 @@ class Reason(StrEnum):
     NOT_FOUND = "no collision-free pose was found"
     BETWEEN = "resolving them makes in-between poses collide"
     AS_WRITTEN = "the file format can't store the correction"
-    STOPPED = "it was stopped before"
+    STOPPED = "the budget ended before they were resolved"
 
 
 @dataclass(frozen=True)

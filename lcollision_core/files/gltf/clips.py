@@ -28,6 +28,7 @@ from lcollision_core.files.scene.transforms import (
     global_transforms,
     signs_on_one_side,
     slerp,
+    unit_quaternions,
 )
 from lcollision_core.json_values import quoted
 from lcollision_core.meshes.topology import FloatArray
@@ -39,6 +40,9 @@ _NODE_POINTER = re.compile(r"/nodes/(\d{1,9})/(translation|rotation|scale|weight
 
 _SAME_TIME = 1e-5
 """Tolerance of key times in seconds, as they are stored in single precision."""
+
+_ROUNDED = 1e-6
+"""Tolerance of a rotation's length, as a quaternion is stored in single precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +220,9 @@ class ClipTracks:
         shape = (len(times), 3) if interpolation == "CUBICSPLINE" else (len(times),)
         kind = "SCALAR" if path == _WEIGHTS else f"VEC{width}"
         values = as_float(read(sampler["output"], what, (kind,)))
+        if path == "rotation" and interpolation != "CUBICSPLINE":
+            is_unit = np.abs(np.linalg.norm(values, axis=1, keepdims=True) - 1.0) < _ROUNDED
+            values = np.where(is_unit, values, unit_quaternions(values))
         return Track((node,), path, interpolation, times, values.reshape(*shape, 1, width))
 
 
@@ -265,8 +272,10 @@ class _GltfClip:
         for times in times_of_bytes.values():
             if not len(times):
                 raise MeshFileError(f"{self.where} has no keys")
-            if not np.isfinite(times).all() or (np.diff(times) < 0.0).any():
-                raise MeshFileError.must_be(what, "finite and ascending", f"{len(times)} others")
+            broken = np.flatnonzero(~np.isfinite(times) | (np.diff(times, prepend=times[0]) < 0.0))
+            if len(broken):
+                key = f"{times[broken[0]]:g} as key {broken[0]} (from 0)"
+                raise MeshFileError.must_be(what, "finite and ascending", key)
         return times_of
 
     def key_times(self) -> FloatArray:
@@ -307,8 +316,7 @@ class _GltfClip:
             what = f"the {path} values of {self.where}"
             raise MeshFileError(f"key {broken[0]} (from 0) of {what} is not finite")
         if path == "rotation" and values.ndim == 3:
-            lengths = np.linalg.norm(values, axis=-1, keepdims=True)
-            values = values / np.where(lengths > 0.0, lengths, 1.0)
+            values = unit_quaternions(values)
         return values
 
     def __call__(self, times: FloatArray) -> ScenePoses:

@@ -25,10 +25,7 @@ def compose(translation: FloatArray, rotation: FloatArray, scale: FloatArray) ->
     -------
     (..., 4, 4) float64 array
     """
-    length = np.linalg.norm(rotation, axis=-1, keepdims=True)
-    identity = np.array([0.0, 0.0, 0.0, 1.0])
-    unit = np.where(length > 0.0, rotation / np.where(length > 0.0, length, 1.0), identity)
-    x, y, z, w = np.moveaxis(unit, -1, 0)
+    x, y, z, w = np.moveaxis(unit_quaternions(rotation), -1, 0)
     result = np.zeros((*translation.shape[:-1], 4, 4))
     result[..., 0, 0] = 1.0 - 2.0 * (y * y + z * z)
     result[..., 0, 1] = 2.0 * (x * y - z * w)
@@ -43,6 +40,13 @@ def compose(translation: FloatArray, rotation: FloatArray, scale: FloatArray) ->
     result[..., :3, 3] = translation
     result[..., 3, 3] = 1.0
     return result
+
+
+def unit_quaternions(rotation: FloatArray) -> FloatArray:
+    """Normalise (..., 4) quaternions x, y, z, w; one of length 0 becomes the identity."""
+    length = np.linalg.norm(rotation, axis=-1, keepdims=True)
+    identity = np.array([0.0, 0.0, 0.0, 1.0])
+    return np.where(length > 0.0, rotation / np.where(length > 0.0, length, 1.0), identity)
 
 
 def decompose(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

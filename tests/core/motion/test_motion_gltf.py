@@ -82,6 +82,26 @@ def test_a_clip_that_begins_late_stays_as_long_as_it_was(tmp_path: Path) -> None
     assert times[0] == 10.0
 
 
+def test_rotations_of_any_length_are_read_back_as_they_were_read(tmp_path: Path) -> None:
+    source = write_gltf(swinging_body(), tmp_path / "body.glb")
+    document = GltfDocument(source.read_bytes(), source).editable()
+    swing = document.description["animations"][0]
+    for channel in swing["channels"]:
+        if channel["target"]["path"] == "rotation":
+            sampler = swing["samplers"][channel["sampler"]]
+            values = document.array(sampler["output"], "a rotation", ("VEC4",)).copy()
+            values[::2] *= 3.0
+            values[SPAN[5]] = 0.0  # the identity
+            sampler["output"] = document.add_array(values)
+    source.write_bytes(document.encoded())
+    body = RigBody.of(read_character(source))
+    changed, codes = change(body, [SPAN])
+    data = changed_gltf(body.character, [changed])
+    frames = list(clip_vertices(data, source, CLIP, changed.times))
+    for frame in SPAN:
+        assert np.abs(frames[frame] - body.decode(codes[frame])).max() < 1e-5 * body.body_size
+
+
 def test_what_is_changed_has_one_channel_and_no_matrix(tmp_path: Path) -> None:
     source = write_gltf(swinging_body(), tmp_path / "body.glb")
     document = GltfDocument(source.read_bytes(), source).editable()
