@@ -33,7 +33,7 @@ from lcollision_core.files import (
 from lcollision_core.files.motion.smpl import refuse_pickle
 from lcollision_core.files.safe import atomic_write, read_regular
 from lcollision_core.files.scene_files import SceneDocument, open_scene
-from lcollision_core.files.table import SCENE_SUFFIXES, SMPL_SUFFIX
+from lcollision_core.files.table import FILES, MODEL_SUFFIX, SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.json_values import from_json, parse_document
 from lcollision_core.meshes import ContactRules, Topology
 from lcollision_core.meshes.topology import FloatArray
@@ -386,6 +386,13 @@ def open_body(
     if isinstance(source, SceneDocument | Character):
         return open_character(source, up)
     refuse_pickle(source)
-    if Path(source).suffix.lower() in (*SCENE_SUFFIXES, SMPL_SUFFIX):
+    suffix = Path(source).suffix.lower()
+    if suffix in (*SCENE_SUFFIXES, SMPL_SUFFIX):
         return open_character(source, up)
+    if suffix in FILES and suffix != MODEL_SUFFIX and Path(source).is_file():
+        raise MeshFileError(
+            f"is a {suffix} file, which holds no body that can be posed",
+            f"name a model, or the file of a rigged character ({', '.join(SCENE_SUFFIXES)})",
+            where=source,
+        )
     return LearnedBody.load(source)

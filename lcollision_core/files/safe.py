@@ -18,7 +18,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from mimetypes import MimeTypes
 from pathlib import Path, PurePath
 from tokenize import TokenError
@@ -35,6 +35,8 @@ _KINDS = (
     (stat.S_ISFIFO, "a named pipe"),
     (stat.S_ISSOCK, "a socket"),
 )
+
+_LFS_POINTER = b"version https://git-lfs"
 
 
 def require_regular(path: str | os.PathLike[str]) -> int:
@@ -60,10 +62,17 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
 
     Raises
     ------
-    OSError, ValueError : see `require_regular`, or reading is not permitted.
+    OSError, ValueError : see `require_regular`, reading is not permitted, or it is a pointer of Git
+        LFS, as clones have that were made without it.
     """
     require_regular(path)
-    return Path(path).open("rb")
+    with ExitStack() as opened:
+        file = opened.enter_context(Path(path).open("rb"))
+        if file.peek(len(_LFS_POINTER)).startswith(_LFS_POINTER):
+            what = "it is a pointer of Git LFS; `git lfs pull` fetches the file itself"
+            raise OSError(errno.EINVAL, what, os.fspath(path))
+        opened.pop_all()
+    return file
 
 
 def read_regular(path: str | os.PathLike[str], most_bytes: int) -> bytes:

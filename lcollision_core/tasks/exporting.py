@@ -106,21 +106,21 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
         return Output(path, "folder", None)
     must_be_folder = name.endswith(("/", os.sep))
     forms: dict[str, Literal["poses", "mesh", "frames"]] = {".json": "poses", ".vrm": "mesh"}
-    forms |= dict.fromkeys(WRITABLE_SUFFIXES, "mesh")
+    if of_motions:
+        forms |= dict.fromkeys((".glb", *SKELETON_SUFFIXES, *OWN_SUFFIXES), "mesh")
+    else:
+        forms |= dict.fromkeys(WRITABLE_SUFFIXES, "mesh")
     if pose_form == "clip":
         forms |= {".glb": "frames", ".vrm": "frames"}
     forms |= dict.fromkeys(POINT_CACHE_SUFFIXES, "frames")
-    if of_motions:
-        forms |= dict.fromkeys((*OWN_SUFFIXES, *SKELETON_SUFFIXES), "mesh")
     if not must_be_folder and suffix in forms:
         require_writable(path)
         return Output(path, forms[suffix], file_stamp(path))
     if not must_be_folder and has_known_suffix(path):
         raise LCollisionError.unwritable(
             path,
-            f"{suffix} is not a known format",
-            f"use one of {', '.join((*WRITABLE_SUFFIXES, *POINT_CACHE_SUFFIXES))}, .json or a "
-            "folder",
+            f"{suffix} is not a format of {'motions' if of_motions else 'poses'}",
+            f"use one of {', '.join(forms)} or a folder",
         )
     require_writable(path)
     if path.exists():

@@ -34,7 +34,8 @@ from lcollision_core.files import (
     write_mesh,
     write_pose_set,
 )
-from lcollision_core.files.motion.caches import write_point_cache
+from lcollision_core.files.motion.bvh import read_bvh
+from lcollision_core.files.motion.caches import read_point_cache, write_point_cache
 from lcollision_core.files.safe import open_regular
 from lcollision_core.files.table import READABLE_SUFFIXES
 from lcollision_core.labels import StoreIdentity
@@ -607,6 +608,21 @@ def test_what_is_no_plain_file_is_never_opened(
     Path("m.gltf").write_bytes(_scene("b.bin"))
     with pytest.raises(MeshFileError, match=r"m\.gltf .*its buffer 'b\.bin' cannot be read"):
         read_mesh("m.gltf")
+
+
+def test_a_pointer_of_git_lfs_is_named(tmp_path: Path) -> None:
+    readers: dict[str, Callable[[Path], Any]] = {
+        **dict.fromkeys(READABLE_SUFFIXES, read_mesh),
+        ".npz": read_pose_set,
+        ".bvh": read_bvh,
+        ".pc2": read_point_cache,
+        ".json": lambda path: read_poses(path, stored("tube")),
+    }
+    for suffix, read in readers.items():
+        path = tmp_path / f"f{suffix}"
+        path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+        with pytest.raises(LCollisionError, match=r"pointer of Git LFS; `git lfs pull`"):
+            read(path)
 
 
 def _scene(uri: str) -> bytes:

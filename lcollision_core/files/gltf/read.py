@@ -311,10 +311,9 @@ def read_shown(document: GltfDocument) -> Scene:
     parents, order, local, rest = _nodes(document)
     primitives, notes = _shown_primitives(document, parents)
     if not primitives:
-        n_meshes = len(document.objects("meshes"))
-        if not n_meshes and document.objects("animations"):
+        if not document.objects("meshes") and document.objects("animations"):
             raise NoMeshError(*NO_MESH)
-        what = f"it holds {n_meshes} meshes, none of which shows triangles"
+        what = "it shows no triangles"
         raise MeshFileError(f"{what} ({'; '.join(notes)})" if notes else what)
     looks = GltfLooks(document)
     parts = tuple(_part(document, primitive, rest, looks) for primitive in primitives)

@@ -223,7 +223,7 @@ def read_shown(source: FbxDocument) -> Scene:
     if not shown_nodes and len(answer["clips"]):
         raise NoMeshError(*NO_MESH)
     if not parts:
-        raise MeshFileError(f"it holds {len(shown_nodes)} meshes, none of which shows faces")
+        raise MeshFileError("it shows no triangles")
     require_plausible_count(sum(len(part.points) for part in parts), "vertices")
     weights = tuple(answer[f"{number} weights"][None] for number in numbers)
     return Scene(

@@ -208,7 +208,7 @@ def test_resolve_writes_what_it_checked(
         ("out.obj", ("--like", "other.obj"), "has 3 vertices"),
         ("out.json", ("--like", "own.obj"), "would contain codes"),
         ("out.glb", ("--form", "morph"), "applies only to a character's file"),
-        ("out.fbx", (), ".fbx is not a known format; use one of"),
+        ("out.fbx", (), ".fbx is not a format of poses; use one of"),
     ],
 )
 def test_what_cannot_be_is_one_sentence_and_writes_nothing(

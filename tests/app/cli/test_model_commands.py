@@ -488,7 +488,7 @@ def test_form_of_the_output_decides_what_decode_writes(
     assert sorted(path.name for path in existing.iterdir()) == ["sample 1.obj", "sample 2.obj"]
     for output, sentence in (
         (tmp_path / "both.obj", "2 poses; name a folder"),
-        (tmp_path / "both.xyz", ".xyz is not a known format"),
+        (tmp_path / "both.xyz", ".xyz is not a format of poses"),
         (tmp_path / ("x" * 300), "File name too long"),
         (tmp_path / "none" / "folder", "there is no folder"),
         (one / "folder", "there is no folder"),

@@ -496,9 +496,9 @@ def test_an_output_that_cannot_be_is_refused_first(
     (tmp_path / "free").write_text("mine")
     for out, sentence in (
         (tmp_path / "no" / "free.json", "there is no folder"),
-        (tmp_path / "free.docx", ".docx is not a known format"),
-        (tmp_path / "free.fbx", ".fbx is not a known format"),
-        (tmp_path / "free.txt", ".txt is not a known format"),
+        (tmp_path / "free.docx", ".docx is not a format of poses"),
+        (tmp_path / "free.fbx", ".fbx is not a format of poses"),
+        (tmp_path / "free.txt", ".txt is not a format of poses"),
         (tmp_path / ("x" * 300 + ".json"), "File name too long"),
         (tmp_path / ("x" * 300), "File name too long"),
         (f"{tmp_path / 'free'}/", "cannot be created: a file has this name; name another"),
