@@ -203,8 +203,16 @@ def _global_options(
         edit()
 
 
+def _open_closed_streams() -> None:
+    """Replace standard streams that the caller closed; the next file would take their number."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: PTH123, SIM115 - open until the end
+
+
 def main() -> None:
     """Run the command line and exit with an `ExitStatus`."""
+    _open_closed_streams()
     try:
         app()
     except Exception:  # the last resort: a bug must not look like a result

@@ -281,7 +281,8 @@ def _resolve_poses(
     body, output, export = request.body, request.output, request.export
     scene = as_scene(body)
     if not inputs and scene is None:
-        raise LCollisionError("names no pose to resolve", "name files of poses or meshes")
+        add = "name files of poses or meshes, or add --motion for its clips"
+        raise LCollisionError("names no pose to resolve", add)
     if request.keep_detail and output.form == "poses":
         raise LCollisionError(
             "would contain codes; --keep-detail applies only to meshes",

@@ -227,7 +227,11 @@ def run_of_rows(
     with locked(path, wait=0.0):
         run = Run(path, key, total, "file", read, write, job, pause=-1.0)
         run.begin()
-        yield run
+        try:
+            yield run
+        except BaseException:
+            run.stop()
+            raise
         run.finish()
 
 

@@ -135,3 +135,9 @@ def test_on_a_terminal_compiling_is_told_once_and_only_where_it_happens(tmp_path
     assert said(pty.openpty) == b"."
     shutil.rmtree(tmp_path / "__pycache__")
     assert said(os.pipe) == b"."
+
+
+def test_closed_streams_change_no_exit_status(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "app", "check", tmp_path / "none.obj"]
+    closed = ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *map(str, command)]
+    assert subprocess.run(closed, check=False).returncode == 2

@@ -23,7 +23,7 @@ from lcollision_core.bodies import (
     write_poses,
 )
 from lcollision_core.bodies.motions import read_motions
-from lcollision_core.errors import LCollisionError
+from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.files import read_character, write_mesh
 from lcollision_core.files.motion.caches import (
     cache_rate,
@@ -432,6 +432,23 @@ def write_and_stop(path, *arguments, **options):
 safe.atomic_write = write_and_stop
 main.main()
 """
+
+
+def test_a_folder_that_is_interrupted_says_how_to_continue(swing: Path, tmp_path: Path) -> None:
+    body, notes = open_body(swing), list[str]()
+    folder = captured(swing, tmp_path / "captured", {"walk 0": slice(9), "walk 1": slice(None)})
+    request = ResolveMotionsRequest.of_folder(body, folder, tmp_path / "free")
+    request = replace(request, workers=1)
+    job = Job(note=notes.append)
+
+    def stop_after_the_first(status: FolderStatus) -> None:
+        if status.n_done:
+            job.cancel()
+
+    with pytest.raises(CancelledError):
+        resolve_folder(request, job.part(stop_after_the_first))
+    partial = tmp_path / "free" / "motions.partial.json"
+    assert f"stopped; {partial} has 1 of 2 files, run the same command again to continue" in notes
 
 
 @pytest.mark.slow
