@@ -16,7 +16,8 @@ from app.cli.console import (
     progress_bar,
     tell,
 )
-from app.cli.inputs import (
+from app.cli.options import refuse_given, takes_options
+from app.cli.shared_options import (
     ClearanceOption,
     DeviceOption,
     ErrorBoundOption,
@@ -26,7 +27,6 @@ from app.cli.inputs import (
     RestOption,
     TouchOption,
 )
-from app.cli.options import refuse_given, takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options import NO_SCENE, MotionChoice, RuleOptions, SceneOptions

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import JsonOption, note, print_json, progress_bar, tell
-from app.cli.inputs import ModelArgument
 from app.cli.options import takes_options
+from app.cli.shared_options import ModelArgument
 from lcollision_core.options import RuleOptions
 from lcollision_core.tasks.words import counted
 

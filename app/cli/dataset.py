@@ -9,11 +9,11 @@ import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.contacts import rules_sentence
-from app.cli.inputs import Axis, PoseSetArgument, up_sentence
 from app.cli.options import refuse_given, takes_options
+from app.cli.shared_options import Axis, PoseSetArgument
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options import NO_CHANGE, RuleOptions
-from lcollision_core.tasks.words import counted
+from lcollision_core.tasks.words import counted, up_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -101,7 +101,7 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
     if as_json:
         print_json(report)
     else:
-        _print(path, report, up_sentence(guess))
+        _print(path, report, up_text(guess))
         if not rules.exclude_nothing:
             tell(f"  {rules_sentence(rules, report['excluded_at_rest'])}")
         _print_proposed(proposed, rules)
@@ -267,5 +267,5 @@ def _gathered(
         n_drawn = counted(drawn["drawn"], "pose")
         note(f"{drawn['free']} of {n_drawn} by the rig are free of collisions")
     if not (guess := poses.up).is_sure:
-        note(f"{up_sentence(guess)}; --up x|y|z overrides it")
+        note(f"{up_text(guess)}; --up x|y|z overrides it")
     return poses

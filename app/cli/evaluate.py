@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import JsonOption, cancellable_bar, note, print_json, tell
-from app.cli.inputs import DeviceOption, ModelArgument, RowsOption
 from app.cli.models import measured_model, measured_model_sentence
+from app.cli.shared_options import DeviceOption, ModelArgument, RowsOption
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError
 from lcollision_core.tasks.words import counted, scores_text

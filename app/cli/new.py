@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from app.cli.console import JsonOption, cancel_on_interrupt, note, print_json, status_bar, tell
 from app.cli.contacts import note_rules
 from app.cli.evaluate import kind_lines
-from app.cli.inputs import DeviceOption, ModelOutput
 from app.cli.options import takes_options
+from app.cli.shared_options import DeviceOption, ModelOutput
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.options import LearningRequest

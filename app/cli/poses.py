@@ -17,7 +17,8 @@ from app.cli.console import (
     tell,
 )
 from app.cli.contacts import note_rules
-from app.cli.inputs import (
+from app.cli.options import takes_options
+from app.cli.shared_options import (
     ClearanceOption,
     DeviceOption,
     ErrorBoundOption,
@@ -30,7 +31,6 @@ from app.cli.inputs import (
     ScaleOption,
     TouchOption,
 )
-from app.cli.options import takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.jobs import Job
 from lcollision_core.options import NO_SCENE, ExportRequest, RuleOptions, SceneOptions

@@ -22,7 +22,8 @@ from app.cli.console import (
     tell,
 )
 from app.cli.contacts import excluded_at_rest, note_rules
-from app.cli.inputs import (
+from app.cli.options import Excluding, refuse_given, takes_options
+from app.cli.shared_options import (
     DeviceOption,
     FormOutput,
     InPlaceOption,
@@ -32,7 +33,6 @@ from app.cli.inputs import (
     ThreadsOption,
     TouchOption,
 )
-from app.cli.options import Excluding, refuse_given, takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
@@ -45,11 +45,7 @@ from lcollision_core.options import (
     SceneOptions,
 )
 from lcollision_core.tasks.verdicts import FailedFile
-from lcollision_core.tasks.words import (
-    duration_text,
-    resolved_clip_text,
-    resolved_pose_text,
-)
+from lcollision_core.tasks.words import duration_text, resolved_clip_text, resolved_pose_text
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body

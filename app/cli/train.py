@@ -13,20 +13,13 @@ import typer
 
 from app.cli.console import cancel_on_interrupt, note, progress_bar, status_bar
 from app.cli.evaluate import StoreArgument, kind_lines, open_store
-from app.cli.inputs import (
-    Axis,
-    ModelArgument,
-    ModelOutput,
-    PoseSetArgument,
-    RowsOption,
-    up_sentence,
-)
 from app.cli.models import describe, error_sentence, measured_model_sentence, note_if_beside
 from app.cli.options import takes_options
+from app.cli.shared_options import Axis, ModelArgument, ModelOutput, PoseSetArgument, RowsOption
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import Job
 from lcollision_core.options import RuleOptions
-from lcollision_core.tasks.words import error_rates_text, scores_text
+from lcollision_core.tasks.words import error_rates_text, scores_text, up_text
 
 if TYPE_CHECKING:
     from app.cli.console import BarContent
@@ -95,7 +88,7 @@ def embedding(
         poses = poses.scaled(scale)
     guess = poses.up
     if up is None and not guess.is_sure:
-        note(f"{up_sentence(guess)}; --up x|y|z overrides it, now or by `lcollision upright`")
+        note(f"{up_text(guess)}; --up x|y|z overrides it, now or by `lcollision upright`")
     poses = replace(poses, up_axis=guess.axis if up is None else "xyz".index(up))
     for remark in poses.notes:
         note(f"{dataset}: {remark}")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import MirroredPose
+    from lcollision_core.meshes import UpGuess
     from lcollision_core.resolve import ResolveResult
     from lcollision_core.tasks.verdicts import CheckedClip, CheckedMesh, PrintedFigure, ResolvedClip
 
@@ -165,6 +166,14 @@ def mirrored_text(mirrored: MirroredPose) -> str:
         return say("restored to the unmirrored pose, {state}", state=state)
     error = fit_error(mirrored.fit_error_mean, mirrored.fit_error_max)
     return say("mirrored with a {error}, {state}", error=error, state=state)
+
+
+def up_text(guess: UpGuess) -> str:
+    """Describe which axis was taken as up, and why."""
+    axis = "xyz"[guess.axis]
+    if guess.is_sure:
+        return say("{axis} is up: {reason}", axis=axis, reason=guess.reason)
+    return say("{axis} is probably up: {reason}", axis=axis, reason=guess.reason)
 
 
 def scores_text(scores: Mapping[str, Any], n_samples: int | None = None) -> str:

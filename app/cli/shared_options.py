@@ -1,17 +1,13 @@
-"""Inputs of commands: files, folders of meshes, units."""
+"""Arguments and options that several commands take."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from lcollision_core.devices import Device
-
-if TYPE_CHECKING:
-    from lcollision_core.meshes import UpGuess
-
 
 Axis = Literal["x", "y", "z"]
 
@@ -144,8 +140,3 @@ InPlaceOption = Annotated[
     bool,
     typer.Option("--in-place", help="Let the output replace a file that the command reads."),
 ]
-
-
-def up_sentence(guess: UpGuess) -> str:
-    """Report which axis was taken as up, and why."""
-    return f"{'xyz'[guess.axis]} is {'' if guess.is_sure else 'probably '}up: {guess.reason}"
