@@ -13,7 +13,7 @@ from scipy import sparse
 from lcollision_core.contact.detector import CollisionDetector
 from lcollision_core.contact.exclusions import require_listable
 from lcollision_core.contact.kernels import NEAR
-from lcollision_core.contact.reach import Lists, faces_within, surface_of
+from lcollision_core.contact.reach import Lists, faces_within, lists_of, matrix_of, surface_of
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.contact_rules import MAX_TOUCHING, STRICT
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup, require_groups
@@ -97,7 +97,7 @@ def touching_patches(
     ends = np.cumsum([len(pairs) for pairs in touching])
     for rows in np.split(places.ravel(), ends[:-1]):
         one_way = of_first[rows].T @ of_second[rows]
-        n_poses_of += ((one_way + one_way.T) > 0).astype(np.int32)
+        n_poses_of += (one_way + one_way.T).astype(np.int32)
     often = sparse.triu(n_poses_of).tocoo()
     is_frequent = often.data >= NEARLY_ALWAYS * len(vertices)
     patches = np.stack([often.row, often.col], axis=1)
@@ -154,9 +154,7 @@ def _patches(
             patch_roots.append(face)
     middles = np.array(patch_roots, dtype=np.int32)
     lists = within(middles, 1.0)
-    shape = (len(middles), detector.topology.n_faces)
-    ones = np.ones(len(lists.entry), dtype=np.int32)
-    return middles, sparse.csr_matrix((ones, lists.entry, lists.start), shape=shape).T.tocsr()
+    return middles, matrix_of(lists, detector.topology.n_faces).T.tocsr()
 
 
 def _covering(
@@ -251,19 +249,20 @@ class _Tally:
         for group in groups:
             by_faces.setdefault(group.faces.tobytes(), group)
         self._groups = list(by_faces.values())
-        self._member = _members(self._groups, n_faces)
+        members = lists_of([group.faces for group in self._groups], n_faces)
+        self._member = matrix_of(members, len(self._groups))
         self._in_contact = np.zeros(2 * (len(self._groups),), dtype=np.int64)
         self._n_poses = 0
 
     def add(self, pairs: npt.NDArray[np.integer]) -> None:
         """Count a pose with (P, 2) pairs of faces in contact."""
         first, second = self._member[pairs[:, 0]], self._member[pairs[:, 1]]
-        one_way = (first.T @ second).toarray() > 0
+        one_way = (first.T @ second).toarray()
         self._in_contact += one_way | one_way.T
         self._n_poses += 1
 
     def proposals(self, least_share: float) -> tuple[ProposedPair, ...]:
-        overlap = (self._member.T @ self._member).toarray() > 0
+        overlap = (self._member.T @ self._member).toarray()
         share = np.where(overlap, 0.0, self._in_contact / max(1, self._n_poses))
         first, second = np.nonzero(np.triu(share >= least_share, k=1))
         order = np.argsort(-share[first, second], kind="stable")
@@ -271,11 +270,3 @@ class _Tally:
             ProposedPair((self._groups[a].name, self._groups[b].name), float(share[a, b]))
             for a, b in zip(first[order], second[order], strict=True)
         )
-
-
-def _members(groups: Sequence[FaceGroup], n_faces: int) -> sparse.csr_matrix:
-    """Return (F, G) ones where a face is in a group."""
-    faces = np.concatenate([np.empty(0, dtype=np.int64), *(group.faces for group in groups)])
-    of_group = np.repeat(np.arange(len(groups)), [len(group.faces) for group in groups])
-    ones = np.ones(len(faces), dtype=np.int32)
-    return sparse.csr_matrix((ones, (faces, of_group)), shape=(n_faces, len(groups)))

@@ -82,7 +82,7 @@ def no_lists(n: int) -> Lists:
 def lists_of(members: Sequence[npt.NDArray[np.integer]], n: int) -> Lists:
     """List for each of n items the numbers of the sets that contain it."""
     which = np.repeat(np.arange(len(members)), [len(some) for some in members])
-    return _table(np.concatenate(members), which, n, len(members))
+    return _table(np.concatenate([np.empty(0, np.int64), *members]), which, n, len(members))
 
 
 def surface_of(topology: Topology, reference: FloatArray) -> Surface:
@@ -115,9 +115,9 @@ def faces_within(
     near = _reached(surface, vertices.astype(np.int32), distance, require)
     n_faces, n_vertices = len(surface.corners), len(surface.face_start) - 1
     of_corners = Lists(3 * np.arange(len(faces) + 1), corners.ravel().astype(np.int32))
-    at_corners = _matrix(of_corners, len(vertices))
-    at_vertices = _matrix(Lists(surface.face_start, surface.face), n_faces)
-    near_corners = _matrix(near, n_vertices)
+    at_corners = matrix_of(of_corners, len(vertices))
+    at_vertices = matrix_of(Lists(surface.face_start, surface.face), n_faces)
+    near_corners = matrix_of(near, n_vertices)
 
     def search(first: int, last: int) -> tuple[LongArray, IntArray]:
         product = at_corners[first:last] @ near_corners @ at_vertices
@@ -234,12 +234,13 @@ def _listed(
     counts, entries = zip(*(parts[first] for first in sorted(parts)), strict=True)
     start, entry = _starts(np.concatenate(counts)), np.concatenate(entries)
     # Sorted here, as Numba takes two seconds to compile a sort.
-    table = _matrix(Lists(start, entry), int(entry.max(initial=0)) + 1)
+    table = matrix_of(Lists(start, entry), int(entry.max(initial=0)) + 1)
     table.sort_indices()
     return Lists(start, table.indices.astype(np.int32))
 
 
-def _matrix(lists: Lists, n_columns: int) -> sparse.csr_matrix:
+def matrix_of(lists: Lists, n_columns: int) -> sparse.csr_matrix:
+    """Return the bool matrix whose row i is true in the columns of list i."""
     ones = np.ones(len(lists.entry), dtype=np.bool_)
     return sparse.csr_matrix((ones, lists.entry, lists.start), (len(lists.start) - 1, n_columns))
 

@@ -26,11 +26,6 @@ UNDIVIDED_SIZE = 128
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 _LARGEST_WEIGHT, _LEAST_DEVIATION = 1e4, 1e-6
-_LARGEST_OUTPUT = 1e18
-"""Largest number that float32 can square."""
-
-_INPUTS_PER_FEATURE = 10.0
-"""A network's inputs are at most this many times the largest deformation feature."""
 
 
 def require_network(arrays: Arrays, embedding: Embedding, preset: str, by_domain: bool) -> None:
@@ -45,8 +40,8 @@ def require_network(arrays: Arrays, embedding: Embedding, preset: str, by_domain
 
     Raises
     ------
-    ValueError : an array is missing or unknown, has another type or shape, or holds numbers that
-        would overflow.
+    ValueError : an array is missing or unknown, has another type or shape, or holds numbers far
+        beyond trained ones.
     """
     reader = _Reader(arrays)
     if preset == "paper":
@@ -80,9 +75,7 @@ class _Reader:
         n_sites = 0 if vertices.ndim == 2 and not len(vertices) else None
         return self.array("site_vertices", n_sites, None, dtype=np.int32)
 
-    def layers(
-        self, names: Sequence[str], sizes: Sequence[int | None], n: int | None, bound: float
-    ) -> float:
+    def layers(self, names: Sequence[str], sizes: Sequence[int | None], n: int | None) -> None:
         """Read the layers of n stacked networks, or of a single one, in order.
 
         Parameters
@@ -90,24 +83,12 @@ class _Reader:
         names : of the layers
         sizes : of the inputs and of each layer's outputs, None for any
         n : number of stacked networks; None for a single one
-        bound : of the inputs
-
-        Returns
-        -------
-        bound : of the outputs, from the sums of absolute weights
         """
         stacked, of_bias = ((), ()) if n is None else ((n,), (n, 1))
         width = sizes[0]
         for name, n_out in zip(names, sizes[1:], strict=True):
-            weight = self.array(f"{name}.weight", *stacked, width, n_out)
-            width = weight.shape[-1]
-            bias = self.array(f"{name}.bias", *of_bias, width)
-            if weight.size:
-                sums = np.abs(weight).sum(axis=-2, dtype=np.float64)
-                bound = float(sums.max()) * bound + float(np.abs(bias).max())
-            if bound > _LARGEST_OUTPUT:
-                raise ValueError(f"its array {name}.weight would make numbers that overflow")
-        return bound
+            width = self.array(f"{name}.weight", *stacked, width, n_out).shape[-1]
+            self.array(f"{name}.bias", *of_bias, width)
 
 
 def _require_default(reader: _Reader, embedding: Embedding) -> None:
@@ -120,48 +101,30 @@ def _require_default(reader: _Reader, embedding: Embedding) -> None:
     sites = reader.sites()
     if sites.size and not 0 <= sites.min() <= sites.max() < topology.n_vertices:
         raise ValueError("its array site_vertices refers to vertices that the body doesn't have")
-    decoder = embedding.scaling
-    # Every autoencoder adds at most its scale, as |tanh| does not exceed 1.
-    largest = max(
-        abs(centre) + 2.0 * (embedding.n_domains + 2) / scale
-        for centre, scale in (
-            (decoder.rotation_centre, decoder.rotation_scale),
-            (decoder.stretch_centre, decoder.stretch_scale),
-        )
-    )
-    bound = 1.0
     for name, n, n_in in (
         ("patch", n_points, UNITS.size),
         ("fold", len(sites), N_FEATURES * sites.shape[1]),
     ):
-        mean = reader.array(f"{name}.mean", n, 1, n_in)
+        reader.array(f"{name}.mean", n, 1, n_in)
         deviation = reader.array(f"{name}.deviation", n, 1, n_in)
-        standardised = 0.0
-        if n:
-            if deviation.min() < _LEAST_DEVIATION:
-                raise ValueError(f"its array {name}.deviation must be over {_LEAST_DEVIATION:g}")
-            inputs = _INPUTS_PER_FEATURE * largest + float(np.abs(mean).max())
-            standardised = inputs / float(deviation.min())
+        if n and deviation.min() < _LEAST_DEVIATION:
+            raise ValueError(f"its array {name}.deviation must be over {_LEAST_DEVIATION:g}")
         names = [f"{name}.layers.{number}" for number in range(3)]
-        bound = max(bound, reader.layers(names, (n_in, None, None, 2), n, standardised))
+        reader.layers(names, (n_in, None, None, 2), n)
     sizes = (2 * (n_points + len(sites)), None, None, embedding.n_domains + 2)
-    reader.layers([f"head.{number}" for number in range(3)], sizes, None, bound)
+    reader.layers([f"head.{number}" for number in range(3)], sizes, None)
     reader.array("any_hit", 2)
 
 
 def _require_paper(reader: _Reader, embedding: Embedding, by_domain: bool) -> None:
     groups, state = embedding.group_sizes, ENCODER_SIZES[-1]
-    codes = float(max(-embedding.box.low.min(), embedding.box.high.max()))
     names = [f"encoder.{2 * number}" for number in range(len(ENCODER_SIZES))]
-    bound = reader.layers(names, (sum(groups), *ENCODER_SIZES), None, codes)
+    reader.layers(names, (sum(groups), *ENCODER_SIZES), None)
+    n_outputs = embedding.n_domains if by_domain else 1
     if by_domain:
-        n_outputs = embedding.n_domains
         wide = (state + max(groups[1:]), *PREDICTOR_SIZES, 1)
         names = [f"predictors.{number}" for number in range(len(PREDICTOR_SIZES) + 1)]
-        bound = reader.layers(names, wide, n_outputs, max(bound, codes))
+        reader.layers(names, wide, n_outputs)
     else:
-        n_outputs = 1
-        names = ["undivided.0", "undivided.2"]
-        bound = reader.layers(names, (state, UNDIVIDED_SIZE, 1), None, bound)
-    names = ["classifier.0", "classifier.2"]
-    reader.layers(names, (n_outputs, CLASSIFIER_SIZE, 1), None, bound)
+        reader.layers(["undivided.0", "undivided.2"], (state, UNDIVIDED_SIZE, 1), None)
+    reader.layers(["classifier.0", "classifier.2"], (n_outputs, CLASSIFIER_SIZE, 1), None)
