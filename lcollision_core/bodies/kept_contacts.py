@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.partners import common_name
-from lcollision_core.bodies.retargeting import Retargeting, axes_of
+from lcollision_core.bodies.retargeting import Retargeting
 from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
 from lcollision_core.contact.distance import triangle_distance
 from lcollision_core.meshes.joint_kinds import Role
@@ -92,7 +92,7 @@ class Correspondence:
         }
         theirs = _limbs(source, followed_numbers, own_trunk)[source.rig.heaviest]
         image = np.full(len(theirs), -1, dtype=np.int64)
-        between = axes_of(space.up, space.front) @ axes_of(source.up, source.front).T
+        between = space.body_axes @ source.body_axes.T
         turns = _turns(source, self.source_motion, frame), _turns(space, self.motion, frame)
         for limb in np.unique(theirs).tolist():
             inside, own_vertices = (

@@ -151,11 +151,10 @@ def open_character(
         character = replace(character, clips={})
     model = RigBody.of(character if up is None else with_up_axis(character, up))
     try:
-        entry = known_character(model.fingerprint) if up is None else None
-        if entry is not None and entry.up_axis is not None:
+        entry = known_character(model.fingerprint)
+        if up is None and entry is not None and entry.up_axis is not None:
             model = RigBody.of(with_up_axis(character, entry.up_axis))
             entry = known_character(model.fingerprint)
-        entry = entry or known_character(model.fingerprint)
         if entry is not None and entry.roles is not None:
             model = model.with_roles(dict(entry.roles))
     except (ModelFileError, ShapeError):

@@ -29,7 +29,7 @@ from lcollision_core.bodies.partners import (
 )
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
-from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, limb_children, rig_of
+from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, axes_of, limb_children, rig_of
 from lcollision_core.bodies.standing_pose import (
     ReposedMotion,
     SkeletonMotion,
@@ -55,6 +55,7 @@ from lcollision_core.files.motion.node_motion import (
 from lcollision_core.files.motion.smpl import is_smpl_motion, read_smpl_motion, skeleton_of_smpl
 from lcollision_core.files.motion.vrma import read_vrma, vrma_bytes
 from lcollision_core.files.safe import atomic_write
+from lcollision_core.files.scene.scene import nearest_above
 from lcollision_core.files.scene_files import as_file_error, read_skeleton_scene
 from lcollision_core.files.table import BVH_SUFFIX, SKELETON_SUFFIXES, VRMA_SUFFIX
 from lcollision_core.meshes.joint_kinds import Role, Side
@@ -122,7 +123,7 @@ class Retargeting:
         figure, anatomy, partner, _ = _followed(motion, rest, space, path)
         if len(followed_limbs(partner, space)) < LEAST_JOINTS:
             raise other
-        axes = axes_of(space.up, space.front) @ axes_of(motion.up, anatomy.front).T
+        axes = space.body_axes @ axes_of(motion.up, anatomy.front).T
         frame = nearest_axes(axes[None])
         joints = rig.rest[:, :3, 3]
         scale = _leg_length(rig, space.roles) / _leg_length(rig_of(figure), anatomy.roles)
@@ -368,11 +369,6 @@ def _leg_length(rig: Rig, roles: Sequence[Role]) -> float:
     return max(2.0 * float(np.mean(bones)) if bones else extent, _SHORT)
 
 
-def axes_of(up: FloatArray, front: FloatArray) -> FloatArray:
-    """Return left, up and front as columns."""
-    return np.stack([np.cross(up, front), up, front], axis=1)
-
-
 _LIMBS = {
     Role.SHOULDER: "Shoulder",
     Role.UPPER_ARM: "UpperArm",
@@ -418,7 +414,7 @@ class _Moved:
 
     @classmethod
     def of(cls, space: RigPoseSpace, transforms: FloatArray) -> _Moved:
-        axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
+        axes = space.to_body
         linear = transforms[..., :3, :3] @ np.linalg.inv(space.rig.rest[:, :3, :3])
         # Leave out what a skeleton cannot represent, such as scaled joints.
         left, _, right = np.linalg.svd(linear)
@@ -456,8 +452,7 @@ def bvh_of(space: RigPoseSpace, transforms: FloatArray, frame_time: float) -> by
 
 def transforms_from_bvh(space: RigPoseSpace, bvh: Bvh) -> FloatArray:
     """Return the (T, J, 4, 4) transforms of a rig's joints from a file of `bvh_of`."""
-    rig, parents = space.rig, _one_tree(space.rig)
-    axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
+    rig, parents, axes = space.rig, _one_tree(space.rig), space.to_body
     turns, places = in_world(bvh)
     order, _ = depth_first(parents)
     rows = np.argsort(order)[len(parents) - len(rig.parents) :]
@@ -476,15 +471,13 @@ def _one_tree(rig: Rig) -> npt.NDArray[np.int64]:
 
 def _ends(space: RigPoseSpace) -> FloatArray:
     """Return bone ends at rest relative to their joints, in the axes of `_Moved`: (J, 3)."""
-    rig = space.rig
-    axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
-    owners = rig.heaviest
+    rig, owners = space.rig, space.rig.heaviest
     points = rig.points[np.arange(len(owners)), rig.weights.argmax(axis=1)]
     ways = space.anatomy.axes[:, :, 1]
     along = np.einsum("vi,vi->v", points - rig.rest[owners, :3, 3], ways[owners])
     lengths = np.full(len(ways), 0.02 * space.body_size)
     np.maximum.at(lengths, owners, along)
-    ends: FloatArray = lengths[:, None] * ways @ axes.T
+    ends: FloatArray = lengths[:, None] * ways @ space.to_body.T
     return ends
 
 
@@ -521,18 +514,13 @@ def vrma_of(
     return vrma_bytes(tuple(bones), parents, metres * offsets, turns, hips, times)
 
 
-def require_humanoid(character: Character, space: RigPoseSpace) -> None:
-    """Raise unless a rig can have a VRM animation.
+def _bones(character: Character, space: RigPoseSpace) -> tuple[bool, dict[str, int]]:
+    """Return whether the file names its VRM bones, and the joint of each bone, parents first.
 
     Raises
     ------
     MeshFileError : it lacks bones that VRM requires.
     """
-    _bones(character, space)
-
-
-def _bones(character: Character, space: RigPoseSpace) -> tuple[bool, dict[str, int]]:
-    """Return whether the file names its VRM bones, and the joint of each bone, parents first."""
     rig, bones = space.rig, dict[str, int]()
     if is_gltf(character) and character.file is not None:
         bones_of_file, nodes = human_bones(character.file.document), rig.nodes.tolist()
@@ -609,13 +597,8 @@ def _above(rig: Rig, joint: int) -> list[int]:
 def _parents(rig: Rig, joints: Sequence[int]) -> list[int]:
     """Return each joint's nearest ancestor among the given joints, -1 for the first."""
     number = {joint: place for place, joint in enumerate(joints)}
-    return [
-        next(
-            (number[above] for above in reversed(_above(rig, joint)) if above in number),
-            0 if place else -1,
-        )
-        for place, joint in enumerate(joints)
-    ]
+    above = [nearest_above(rig.parents, joint, number) for joint in joints]
+    return [number.get(joint, 0 if place else -1) for place, joint in enumerate(above)]
 
 
 def _t_pose(
@@ -767,7 +750,7 @@ def require_skeleton(path: str | os.PathLike[str], body: Body) -> None:
             path, "the body has no joints", "name a .pc2 or .mdd file, or a folder"
         )
     if Path(path).suffix.lower() == VRMA_SUFFIX:
-        require_humanoid(body.character, body.joints)
+        _bones(body.character, body.joints)
 
 
 def write_skeleton(

@@ -134,7 +134,7 @@ class _Body:
 
     def __init__(self, space: RigPoseSpace) -> None:
         self._space, rig = space, space.rig
-        self._axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
+        self._axes = space.to_body
         self._places = space.origins @ self._axes.T
         self._bones = np.einsum("ij,njk->nik", self._axes, space.axes)
         """(J, 3, 3) joint axes at rest."""

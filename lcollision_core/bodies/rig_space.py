@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies import rig_kernels
 from lcollision_core.bodies.rig_kernels import PoseShapes
-from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, joint_limits, rig_of
+from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, axes_of, joint_limits, rig_of
 from lcollision_core.errors import ShapeError
 from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.scene.transforms import nearest_winding
@@ -116,6 +116,7 @@ class RigPoseSpace:
     frame_codes : (N, D) float64 array, the codes of the `frames`
     up : (3,) float64 unit vector
     front : (3,) float64 unit vector, the direction that the character faces at rest
+    body_axes : (3, 3) float64 array, left, up and front as columns
     body_size : the unit of the normalised lengths, in the character's unit
 
     Raises
@@ -188,14 +189,14 @@ class RigPoseSpace:
             self._bone_of[joint] = number.get(joint, carried)
 
     def _set_axes(self, rig: Rig, anatomy: Anatomy) -> None:
-        self.anatomy, up, front = anatomy, self.up, anatomy.front
-        self.roles, self.sides, self.front = anatomy.roles, anatomy.sides, front
+        self.anatomy, self.front = anatomy, anatomy.front
+        self.roles, self.sides = anatomy.roles, anatomy.sides
         self.axes: FloatArray = anatomy.axes.copy()
         self._least, self._most = joint_limits(rig, self.roles)
         if rig.moving is not None:
             self._least, self._most = self._least - _ANY_AXIS, self._most + _ANY_AXIS
             self._least[~rig.moving] = self._most[~rig.moving] = 0.0
-        self._body = body = np.stack([np.cross(up, front), up, front], axis=1)
+        self.body_axes = body = axes_of(self.up, self.front)
         root = self._bones[0]
         middle = 0.5 * (self.rest_vertices.min(axis=0) + self.rest_vertices.max(axis=0))
         self._bone_origins = self.origins[self._bones]
@@ -292,6 +293,11 @@ class RigPoseSpace:
         if rig.shapes is not None:
             low, high = [*low, *rig.shapes.low], [*high, *rig.shapes.high]
         return np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
+
+    @property
+    def to_body(self) -> FloatArray:
+        """(3, 3) rotation from the character's axes to left, up and front."""
+        return np.ascontiguousarray(self.body_axes.T)
 
     @property
     def are_shapes(self) -> npt.NDArray[np.bool_]:
@@ -484,7 +490,7 @@ class RigPoseSpace:
         """Return the (B, 3) turns of the bones in their axes, and the (3,) shift."""
         numbers = np.zeros(3 + 3 * len(self._bones))
         numbers[self._place] = codes[: len(self._place)]
-        return numbers[3:].reshape(-1, 3), self._body @ numbers[:3]
+        return numbers[3:].reshape(-1, 3), self.body_axes @ numbers[:3]
 
     def _by_codes(self, numbers: FloatArray) -> FloatArray:
         """Return (..., D) codes from (..., 3 + 3 B) shift and turns; those of shapes are 0."""
@@ -640,7 +646,7 @@ class RigPoseSpace:
             slopes = self._slopes(codes)
             by_turns += self._shapes.pull_back(slopes, given, chosen, *influences[:3], motions[0])
         by_numbers = np.concatenate(
-            [by_shift @ self._body, by_turns.reshape(len(by_shift), 3 * len(self._bones))],
+            [by_shift @ self.body_axes, by_turns.reshape(len(by_shift), 3 * len(self._bones))],
             axis=1,
         )
         by_codes = self._by_codes(by_numbers)
@@ -656,7 +662,7 @@ class RigPoseSpace:
         if self._shapes is not None:
             slopes = self._slopes(codes)
             turned += self._shapes.tangents(slopes, chosen, *influences[:3], motions[0])
-        shifted = np.broadcast_to(self._body.T[:, None], (3, len(chosen), 3))
+        shifted = np.broadcast_to(self.body_axes.T[:, None], (3, len(chosen), 3))
         moved = np.concatenate([shifted, turned.reshape(-1, len(chosen), 3)])
         return np.concatenate([moved[self._place], self._moved_by_shapes(chosen, motions[0])])
 
@@ -700,7 +706,7 @@ class RigPoseSpace:
     def shifted(self, codes: FloatArray, way: FloatArray) -> FloatArray:
         """Move the whole body of (D,) codes by a (3,) normalised displacement."""
         moved: FloatArray = codes.copy()
-        moved[:SHIFTS] += way @ self._body
+        moved[:SHIFTS] += way @ self.body_axes
         return moved
 
     def transforms(self, codes: FloatArray) -> FloatArray:
@@ -759,7 +765,7 @@ class RigPoseSpace:
         if self._bones[0] >= 0:
             origin = self._bone_origins[0]
             place = moved[:, self._bones[0]] @ np.append(origin * self.body_size, 1.0)
-            numbers[:, :3] = (place[:, :3] / self.body_size - origin) @ self._body
+            numbers[:, :3] = (place[:, :3] / self.body_size - origin) @ self.body_axes
         codes = self._by_codes(numbers)
         if shapes is not None:
             codes[:, self.are_shapes] = shapes
@@ -775,7 +781,7 @@ class RigPoseSpace:
         shifts : (N, 3) of the root, in the character's unit
         """
         numbers = np.empty((len(turns), 3 + 3 * len(self._bones)))
-        numbers[:, :3] = shifts @ self._body / self.body_size
+        numbers[:, :3] = shifts @ self.body_axes / self.body_size
         angles = np.einsum("bxi,nbx->nbi", self._bone_axes, turns[:, self._bones])
         numbers[:, 3:] = angles.reshape(len(turns), -1)
         return self._by_codes(numbers)
@@ -875,7 +881,7 @@ class RigPoseSpace:
         offsets[:, 0] = places[:, 0]
         numbers = np.zeros((len(codes), 3 + 3 * len(self._bones)))
         numbers[:, self._place] = codes[:, : len(self._place)]
-        offsets[:, 0] -= numbers[:, :3] @ self._body.T
+        offsets[:, 0] -= numbers[:, :3] @ self.body_axes.T
         turned = Rotation.from_rotvec(numbers[:, 3:].reshape(-1, 3)).as_matrix()
         turned = turned.reshape(linear.shape)
         return JointOffsets(

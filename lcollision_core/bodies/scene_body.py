@@ -123,11 +123,6 @@ class SceneMember:
         return self.holder is None and has_codes
 
     @property
-    def is_rigid(self) -> bool:
-        """Whether it is a prop of constant shape."""
-        return self.holder is not None or (self.moves and not _bends(self.body))
-
-    @property
     def reference(self) -> FloatArray:
         """(V, 3) its rest pose in the scene's unit and coordinates."""
         return self.place.apply(self.body.reference)
@@ -322,7 +317,8 @@ class SceneBody(Body):
             if rules.tolerated_depth:
                 tolerated.append((name, name, rules.tolerated_depth))
             touching += [(a + rows.start, b + rows.start) for a, b in rules.touching]
-            if member.is_rigid and not member.is_fixed:
+            is_prop = member.holder is not None or (member.moves and not _bends(member.body))
+            if is_prop and not member.is_fixed:
                 ignored.append((name, name))
             if member.holder is not None:
                 holding = self._part_of(member)

@@ -603,6 +603,11 @@ def bone_directions(rig: Rig, origins: FloatArray, roles: Sequence[Role]) -> Flo
     return directions
 
 
+def axes_of(up: FloatArray, front: FloatArray) -> FloatArray:
+    """Return left, up and front as columns."""
+    return np.stack([np.cross(up, front), up, front], axis=1)
+
+
 def front_of(
     roles: Sequence[Role], origins: FloatArray, directions: FloatArray, up: FloatArray
 ) -> FloatArray | None:

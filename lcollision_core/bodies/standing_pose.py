@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies.skeletons import anatomy_of, joint_roles, limb_children, rig_of
+from lcollision_core.bodies.skeletons import anatomy_of, axes_of, joint_roles, limb_children, rig_of
 from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.motion.node_motion import least_turns
 from lcollision_core.meshes.joint_kinds import Role, Side, part_names
@@ -242,7 +242,7 @@ def with_standing_rest(motion: SkeletonMotion) -> ReposedMotion:
     hips = marks.axes(places[best], marks.thighs)
     level = hips[:, 2] * (1.0 - up)
     front = np.sign(level[np.abs(level).argmax()]) * np.eye(3)[np.abs(level).argmax()]
-    upright = np.stack([np.cross(up, front), up, front], axis=1)
+    upright = axes_of(up, front)
     rested = _plain_pose(motion, marks, turns, places[best], best, upright)
     return ReposedMotion(motion, rested, up, front, int(samples[best]))
 

@@ -28,7 +28,7 @@ from lcollision_core.files.mesh_file import turn_to_y
 from lcollision_core.files.motion.smpl import SmplModel, read_smpl
 from lcollision_core.files.safe import make_unique
 from lcollision_core.files.scene.joined import JoinedMesh, join_parts, sample_clip
-from lcollision_core.files.scene.scene import Scene, ScenePoses, parents_first
+from lcollision_core.files.scene.scene import Scene, ScenePoses, nearest_above, parents_first
 from lcollision_core.files.scene.transforms import is_regular
 from lcollision_core.files.scene_files import (
     SceneDocument,
@@ -507,7 +507,9 @@ def _rig(
         )
     rig = Rig(
         tuple(make_unique(scene.node_names[node] or f"node {node}" for node in order)),
-        np.array([_parent_joint(scene, node, joint) for node in order], dtype=np.int64),
+        np.array(
+            [joint.get(nearest_above(scene.parents, node, joint), -1) for node in order], np.int64
+        ),
         rest[order],
         np.array(order, dtype=np.int64),
         joint_of_bone[mesh.bone_of].astype(np.int32),
@@ -531,13 +533,6 @@ def _stretch(scene: Scene, order: list[int]) -> FloatArray | None:
     is_even = sizes[:, 2] > 1.0 - _EVEN
     sizes[is_even], axes[is_even] = 1.0, np.eye(3)
     return None if is_even.all() else (axes * sizes[:, None]) @ np.swapaxes(axes, 1, 2)
-
-
-def _parent_joint(scene: Scene, node: int, joint: dict[int, int]) -> int:
-    parent = int(scene.parents[node])
-    while parent >= 0 and parent not in joint:
-        parent = int(scene.parents[parent])
-    return joint.get(parent, -1)
 
 
 def _anchors(scene: Scene, in_skins: set[int]) -> dict[int, int]:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.compiled import compiled
+from lcollision_core.meshes.topology import meeting_corners
 
 _SHARP = np.radians(60.0)
 """Angle between two faces at rest above which their edge is sharp."""
@@ -62,22 +63,9 @@ def corner_normals(
     from scipy.sparse.csgraph import connected_components
 
     flat = unit(_area_normals(rest, faces))
-    corners = np.arange(faces.size).reshape(faces.shape)
-    begin, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    at_begin, at_end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    turned = begin > end
-    low, high = np.where(turned, end, begin), np.where(turned, begin, end)
-    at_low, at_high = np.where(turned, at_end, at_begin), np.where(turned, at_begin, at_end)
-    order = np.lexsort((high, low))
-    one, other = order[:-1], order[1:]
-    meet = (low[one] == low[other]) & (high[one] == high[other])
-    cosine = np.einsum("ij,ij->i", flat[at_low[one] // 3], flat[at_low[other] // 3])
-    meet &= cosine >= np.cos(_SHARP)
-    one, other = one[meet], other[meet]
-    links = (
-        np.concatenate([at_low[one], at_high[one]]),
-        np.concatenate([at_low[other], at_high[other]]),
-    )
+    first, second = meeting_corners(faces)
+    is_smooth = np.einsum("ij,ij->i", flat[first[0] // 3], flat[second[0] // 3]) >= np.cos(_SHARP)
+    links = first[:, is_smooth].ravel(), second[:, is_smooth].ravel()
     graph = coo_array((np.ones(len(links[0]), dtype=np.bool_), links), shape=(faces.size,) * 2)
     n, of_corner = connected_components(graph, directed=False)
     areas = np.repeat(_area_normals(posed, faces), 3, axis=0)

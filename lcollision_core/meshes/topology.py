@@ -56,6 +56,26 @@ def length_graph(edges: IntArray, vertices: FloatArray) -> sparse.csr_matrix:
     return edge_graph(edges, len(vertices), lengths)
 
 
+def meeting_corners(
+    faces: npt.NDArray[np.integer],
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Return the corners of two faces at the ends of each edge that they share.
+
+    Returns
+    -------
+    first, second : (2, n) corners 3 f + c of (F, 3) faces, at the lower and the higher vertex
+    """
+    corners = np.arange(faces.size).reshape(faces.shape)
+    begin, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    low, high = np.minimum(begin, end), np.maximum(begin, end)
+    at = np.stack([corners.ravel(), np.roll(corners, -1, axis=1).ravel()])
+    at = np.where(begin > end, at[::-1], at)
+    order = np.lexsort((high, low))
+    one, other = order[:-1], order[1:]
+    meet = (low[one] == low[other]) & (high[one] == high[other])
+    return at[:, one[meet]], at[:, other[meet]]
+
+
 def _lengths(edges: IntArray, vertices: FloatArray) -> FloatArray:
     # Column by column: three times faster than the norm of each row.
     way = np.take(vertices, edges[:, 1], axis=0)
@@ -160,18 +180,9 @@ class Topology:
     def pinched_vertices(self) -> IntArray:
         """Indices of the vertices whose faces form several fans that share only the vertex."""
         # Corners of neighbouring faces at the same end of their common edge are in one fan.
-        low, high = self._edge_ends
-        corners = np.arange(3 * self.n_faces).reshape(-1, 3)
-        after = np.roll(corners, -1, axis=1).ravel()
-        is_forward = self.faces.ravel() == low
-        order = np.lexsort((high, low))
-        one, two = order[:-1], order[1:]
-        same = (low[one] == low[two]) & (high[one] == high[two])
-        one, two = one[same], two[same]
-        at_low, at_high = np.where(is_forward, [corners.ravel(), after], [after, corners.ravel()])
-        rows = np.concatenate([at_low[one], at_high[one]])
-        columns = np.concatenate([at_low[two], at_high[two]])
-        graph = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), 2 * (len(order),))
+        first, second = meeting_corners(self.faces)
+        links = np.ones(first.size), (first.ravel(), second.ravel())
+        graph = sparse.coo_matrix(links, 2 * (self.faces.size,))
         n_fans, fan = csgraph.connected_components(graph, directed=False)
         vertex = np.empty(n_fans, dtype=np.int64)
         vertex[fan] = self.faces.ravel()

@@ -67,10 +67,10 @@ def read(file: BinaryIO, _: object = None) -> Polygons:
     if byte_order is None:
         # Convert a text body to a binary one in double precision.
         data = number_rows(plain_lines(data), "row")[0].tobytes()
-        elements = [
-            element._replace(properties=[_as_double(item) for item in element.properties])
-            for element in elements
-        ]
+        for element in elements:
+            element.properties[:] = [
+                _Property(item.name, "f8", item.count_dtype and "f8") for item in element.properties
+            ]
     body = _Body(data, byte_order or "=")
     columns: dict[str, dict[str, _Column]] = {}
     element_names = {"vertex", *_SURFACES} & {element.name for element in elements}
@@ -124,10 +124,6 @@ def _triangles_of_strips(
     is_flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
     triangles = triangles[~is_flat]
     return triangles.reshape(-1)
-
-
-def _as_double(item: _Property) -> _Property:
-    return _Property(item.name, "f8", None if item.count_dtype is None else "f8")
 
 
 def _read_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:

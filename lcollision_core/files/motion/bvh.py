@@ -360,7 +360,9 @@ def bvh_bytes(
             lines += [f"{tabs}\tEnd Site", f"{tabs}\t{{", f"{tabs}\t\tOFFSET {end}", f"{tabs}\t}}"]
         lines += ["\t" * level + "}" for level in range(depth, next_depth - 1, -1)]
     lines += ["MOTION", f"Frames: {len(turns)}", f"Frame Time: {frame_time:.9f}"]
-    for angles, placed in zip(_smooth_angles(turns), places, strict=True):
+    angles = np.zeros(rest.shape)
+    for turned, placed in zip(turns, places, strict=True):
+        angles = angles_near(turned, _WRITTEN_AXES, angles)
         numbers = (
             number
             for joint in order
@@ -385,14 +387,6 @@ def depth_first(parents: npt.NDArray[np.int64]) -> tuple[list[int], list[int]]:
         depths[children[joint]] = depths[joint] + 1
         waiting += children[joint][::-1]
     return order, depths[order].tolist()
-
-
-def _smooth_angles(turns: FloatArray) -> Iterator[FloatArray]:
-    """Yield the (J, 3) angles of each frame in degrees, nearest to those of the frame before."""
-    angles = np.zeros((turns.shape[1], len(_WRITTEN_AXES)))
-    for frame in turns:
-        angles = angles_near(frame, _WRITTEN_AXES, angles)
-        yield angles
 
 
 def _name(name: str, joint: int) -> str:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.scene.joined import sample_clip
-from lcollision_core.files.scene.scene import Clip, Scene, parents_first
+from lcollision_core.files.scene.scene import Clip, Scene, nearest_above, parents_first
 from lcollision_core.files.scene.transforms import are_regular
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.topology import FloatArray
@@ -91,12 +91,9 @@ def motion_of_nodes(
         fps = clip.rate
     times, poses = sample_clip(scene, clip.name, fps)
     number = {node: joint for joint, node in enumerate(nodes)}
-    parents = np.full(len(nodes), -1, dtype=np.int64)
-    for joint, node in enumerate(nodes):
-        above = int(scene.parents[node])
-        while above >= 0 and above not in number:
-            above = int(scene.parents[above])
-        parents[joint] = number.get(above, -1)
+    parents = np.array(
+        [number.get(nearest_above(scene.parents, node, number), -1) for node in nodes], np.int64
+    )
     order = list(nodes)
     rest, moved = scene.rest.transforms[0, order], poses.transforms[:, order]
     at_rest, in_motion = rotations_of(rest), rotations_of(moved)

@@ -85,7 +85,11 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
         "fps": np.array(_frames_per_second(settings)),
         "shown": np.array([node.typed_id for node, _ in shown_meshes], dtype=np.int64),
         "unseen": np.array(_unseen(nodes, shown_meshes), dtype=np.str_),
-        "cached": np.array(_cached(shown_meshes), dtype=np.str_),
+        # Moved by a geometry cache beside the file.
+        "cached": np.array(
+            [node.name for node, mesh in shown_meshes if len(_kept(mesh.cache_deformers))],
+            dtype=np.str_,
+        ),
     }
     for number, (node, mesh) in enumerate(shown_meshes):
         part = _part(node, mesh, most_elements)
@@ -128,11 +132,6 @@ def _unseen(nodes: list[Any], shown: list[tuple[Any, Any]]) -> list[str]:
         for node in nodes
         if _kept(node.mesh) is not None and node.typed_id not in shown_ids
     ]
-
-
-def _cached(shown: list[tuple[Any, Any]]) -> list[str]:
-    """Return the names of the nodes whose mesh is moved by a geometry cache beside the file."""
-    return [node.name for node, mesh in shown if len(_kept(mesh.cache_deformers))]
 
 
 def _clips(scene: Any) -> Iterator[tuple[Any, set[int]]]:

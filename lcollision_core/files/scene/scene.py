@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -329,6 +329,13 @@ def parents_first(parents: npt.NDArray[np.int64]) -> list[int]:
         lost = min(set(range(len(parents))) - set(order))
         raise MeshFileError(f"is damaged: node {lost} (from 0) is its own ancestor", where="it")
     return order
+
+
+def nearest_above(parents: npt.NDArray[np.integer], node: int, among: Container[int]) -> int:
+    """Return the nearest ancestor of a node among some nodes, -1 for none."""
+    while (node := int(parents[node])) >= 0 and node not in among:
+        pass
+    return node
 
 
 def bind_pose(
