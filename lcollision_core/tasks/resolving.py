@@ -641,9 +641,13 @@ def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
                     if row.error:
                         job.note(row.error)
                 run.keep(name, {"stamp": stamps[path], "rows": [row.to_json() for row in rows]})
-                n_bytes_done += stamps[path][0]
-                spent = time.perf_counter() - start
-                seconds_left = spent * (n_bytes - n_bytes_done) / max(n_bytes_done, 1)
+                if any(row.error for row in rows):  # it took no time
+                    n_bytes -= stamps[path][0]
+                else:
+                    n_bytes_done += stamps[path][0]
+                spent, seconds_left = time.perf_counter() - start, None
+                if n_bytes_done:
+                    seconds_left = spent * (n_bytes - n_bytes_done) / n_bytes_done
                 job.report(FolderStatus(len(run.done), len(files), rows, seconds_left))
         row_values = [values for name in paths for values in run.done[name]["rows"]]
         write_table(folder / _TABLE, _COLUMNS, map(_row_of_table, row_values))
