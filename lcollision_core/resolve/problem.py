@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib import import_module
 from threading import Lock
 from typing import Any, Protocol
 
@@ -171,10 +172,11 @@ def single_torch_thread() -> Iterator[None]:
     shared them would wait for each other up to fifty times as long.
     """
     global _inside, _before
-    torch = sys.modules.get("torch")
-    if torch is None:  # a predictor that needs none
+    if "torch" not in sys.modules:  # a predictor that needs none
         yield
         return
+    # Wait if another thread is importing it.
+    torch: Any = import_module("torch")
     with _guard:
         if _inside == 0:
             _before = torch.get_num_threads()

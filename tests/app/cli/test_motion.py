@@ -329,7 +329,7 @@ def captured(swing: Path, folder: Path, frames: Mapping[str, slice | list[int]])
 def test_a_folder_of_motions_comes_to_a_folder_and_goes_on(
     lcollision: Lcollision, swing: Path, tmp_path: Path
 ) -> None:
-    frames = {"walk 10": slice(None), "walk 9": slice(6)}
+    frames = {"walk 10": slice(6, 16), "walk 9": slice(6)}
     folder, out = captured(swing, tmp_path / "captured", frames), tmp_path / "free"
     (folder / "broken.bvh").write_text("HIERARCHY\nMOTION\n")
     (folder / "hero.glb").write_bytes(swing.read_bytes())

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -136,6 +139,25 @@ def test_the_displacement_metric_measures_vertices(tube_model: LearnedBody) -> N
     plain = np.linalg.norm(steps, axis=1) / np.sqrt(squared)
     assert np.std(np.log(ratio)) < np.std(np.log(plain))
     assert (np.linalg.eigvalsh(metric) > 0.0).all()
+
+
+_WHILE_TORCH_IS_IMPORTED = """
+import sys, threading, time
+from lcollision_core.resolve.problem import single_torch_thread
+assert "torch" not in sys.modules
+threading.Thread(target=lambda: __import__("torch")).start()
+while "torch" not in sys.modules:
+    time.sleep(0.001)
+with single_torch_thread():
+    print(sys.modules["torch"].get_num_threads())
+"""
+
+
+@pytest.mark.slow
+def test_a_solve_waits_for_torch_where_another_thread_imports_it() -> None:
+    command = [sys.executable, "-c", _WHILE_TORCH_IS_IMPORTED]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == "1\n"
 
 
 def test_torch_gets_its_threads_back() -> None:
