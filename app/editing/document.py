@@ -13,7 +13,7 @@ from app.editing.library import Library
 from app.editing.live_pose import Pins, PoseMotion
 from app.editing.tasks import Tasks
 from app.editing.timeline import Timeline
-from app.work.long_work import LongWork
+from app.work.threads import LongWork
 from lcollision_core.tasks.opening import OpenedModel
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import QObject, Signal
 
 from app.editing.history import UNNAMED, ChangeState, DocumentState, Origin, PoseHistory, Source
-from app.work.long_work import LongWork
-from app.work.threads import Failure
+from app.work.threads import Failure, LongWork
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.tasks.words import counted
 

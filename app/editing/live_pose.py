@@ -11,8 +11,17 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.history import PoseHistory, read_only
-from app.work.frames import MeasuredFrame, PoseFrame, SpaceFactory, empty_points
-from app.work.pose_worker import CodeTarget, GripTarget, MotionStart, PoseMailbox, PoseRequest
+from app.work.frames import (
+    CodeTarget,
+    GripTarget,
+    MeasuredFrame,
+    MotionStart,
+    PoseFrame,
+    PoseMailbox,
+    PoseRequest,
+    SpaceFactory,
+    empty_points,
+)
 from app.work.threads import Failure, Response, single_shot
 from lcollision_core.tasks.words import counted
 

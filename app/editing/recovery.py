@@ -24,8 +24,7 @@ from PySide6.QtCore import QLockFile, QObject, Signal, Slot
 
 from app.editing.document import PoseDocument
 from app.work.kept_motions import KEY, EditedMotions, to_json_values, unreadable_reason
-from app.work.long_work import LongWork, Task
-from app.work.threads import Failure, guarded, single_shot
+from app.work.threads import Failure, LongWork, Task, guarded, single_shot
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import atomic_write
 from lcollision_core.files.safe import read_regular, require_regular

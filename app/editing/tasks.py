@@ -16,9 +16,8 @@ from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
 
 from app.editing.history import Source, named_after, read_only
 from app.work.kept_motions import EditedMotions, read_lost
-from app.work.long_work import LongWork, Task, as_task
 from app.work.preparing import open_poses_to_show, open_to_show, prepare, ready
-from app.work.threads import Failure
+from app.work.threads import Failure, LongWork, Task, as_task
 from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
 from lcollision_core.tasks import changing
 from lcollision_core.tasks.editing import mirror_poses, resolve_pose, save_poses

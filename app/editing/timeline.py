@@ -15,11 +15,11 @@ from PySide6.QtCore import QObject, Qt, QTimer, Signal, Slot
 
 from app.editing.history import DocumentState, Moment
 from app.editing.tasks import Work
-from app.work.frame_cache import FrameCache, Onion
+from app.work.frames import FrameCache, Onion
 from app.work.kept_motions import EditedMotions
-from app.work.long_work import LongWork
 from app.work.motion_checks import MotionChecks, check_motion, path_of_vertex
 from app.work.preparing import open_motions_to_show
+from app.work.threads import LongWork
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
 from lcollision_core.tasks.editing import free_neighbours, resolve_frames

@@ -36,7 +36,7 @@ from app.window.dialogs.questions import (
     ask_to_turn,
 )
 from app.window.widgets import ListMenu, plain_tip
-from app.work.long_work import as_task
+from app.work.threads import as_task
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.table import (
     CHARACTER_SUFFIXES,

@@ -16,7 +16,7 @@ from app.window.file_actions import FileActions
 from app.window.widgets import plain_tip, restyle
 from app.work import learning_jobs
 from app.work.learning_runs import LearningRun, LearningRuns
-from app.work.long_work import LongWork
+from app.work.threads import LongWork
 from lcollision_core.learning_state import RunState
 from lcollision_core.tasks.words import duration_text, menu_text, one_line
 

@@ -10,9 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from PySide6.QtCore import QObject, QThread, QTimer
+from PySide6.QtCore import QObject, QThread, QTimer, Signal, Slot
 
 from lcollision_core.errors import CancelledError, LCollisionError
+from lcollision_core.jobs import Job, at_most_every
 
 _log = logging.getLogger(__name__)
 
@@ -106,3 +107,170 @@ def guarded(label: str, work: Callable[..., object], *arguments: object) -> Resp
             traceback.format_exc(),
         )
         return Response(failure=failure)
+
+
+Task = Callable[[Job], Any]
+"""Long work, called in another thread; it returns the result."""
+
+
+def as_task(work: Callable[..., Any], *arguments: Any) -> Task:
+    """Return a task of work that neither reports progress nor can be stopped."""
+    return lambda _: work(*arguments)
+
+
+_PROGRESS_SECONDS = 0.1
+"""Least time between two progress reports: each recomposes the whole window."""
+
+
+@dataclass(frozen=True, eq=False)
+class JobRequest:
+    """Long work on a snapshot.
+
+    Attributes
+    ----------
+    request_id : rises from job to job
+    label : as in "Opening poses.json"
+    work : called in the worker's thread
+    job : cancels the work
+    done, failed : called in the window's thread with the work's value, or with its `Failure`
+    """
+
+    request_id: int
+    label: str
+    work: Task
+    job: Job
+    done: Callable[[Any], None]
+    failed: Callable[[Failure], None]
+
+
+class LongWorker(QObject):
+    """Runs one job after the other, in its own thread."""
+
+    answered = Signal(int, object)
+    progressed = Signal(int, object)
+
+    @Slot(object)
+    def answer(self, job: JobRequest) -> None:
+        """Run one job; its errors become its response."""
+        self.answered.emit(job.request_id, guarded(job.label, self._value, job))
+
+    def _value(self, job: JobRequest) -> object:
+        job.job.check()
+
+        def report(*status: Any) -> None:
+            self.progressed.emit(job.request_id, status[0] if len(status) == 1 else status)
+
+        return job.work(job.job.part(at_most_every(_PROGRESS_SECONDS, report)))
+
+
+class LongWork(QObject):
+    """Runs jobs one after the other in its own thread, and reports on them in the window's.
+
+    Signals
+    -------
+    busy_changed : str, the label of the oldest unfinished job, "" if there is none
+    idle : the last job has ended
+    progressed : int and object, the job's number and its progress
+    failed : Failure of a job that was started without `failed`
+    """
+
+    busy_changed = Signal(str)
+    idle = Signal()
+    progressed = Signal(int, object)
+    failed = Signal(object)
+
+    _wanted = Signal(object)
+
+    def __init__(self, parent: QObject | None = None, name: str = "long work") -> None:
+        super().__init__(parent)
+        self._worker = LongWorker()
+        self._thread = started_thread(name, self._worker, self)
+        self._wanted.connect(self._worker.answer)
+        self._worker.answered.connect(self._on_answered)
+        self._worker.progressed.connect(self._on_progressed)
+        self._jobs: dict[int, JobRequest] = {}
+        self._last_id = 0
+
+    @property
+    def busy(self) -> str:
+        """The label of the running job, or ""."""
+        return next((job.label for job in self._jobs.values()), "")
+
+    def label_of(self, number: int) -> str:
+        """Return the label of a job, or "" if it is done."""
+        return self._jobs[number].label if number in self._jobs else ""
+
+    def start(
+        self,
+        label: str,
+        work: Task,
+        done: Callable[[Any], None],
+        failed: Callable[[Failure], None] | None = None,
+    ) -> int:
+        """Queue work behind the jobs started before.
+
+        Parameters
+        ----------
+        label : as in "Opening poses.json"
+        work : called in the other thread with its Job
+        done : called in this thread with the work's value; not after `cancel`
+        failed : called in this thread with the `Failure` of the work; by default the signal
+            `failed` is emitted
+
+        Returns
+        -------
+        number : of the job
+        """
+        self._last_id += 1
+        on_failure = self.failed.emit if failed is None else failed
+        job = JobRequest(self._last_id, label, work, Job(), done, on_failure)
+        self._jobs[job.request_id] = job
+        self._wanted.emit(job)
+        self.busy_changed.emit(self.busy)
+        return job.request_id
+
+    def cancel(self, number: int) -> None:
+        """Stop a job, which signals nothing more. Does nothing if it is done."""
+        job = self._jobs.pop(number, None)
+        if job is not None:
+            job.job.cancel()
+            self.busy_changed.emit(self.busy)
+
+    def cancel_all(self, but: int = 0) -> None:
+        """Stop all jobs, or all but one."""
+        for number in set(self._jobs) - {but}:
+            self.cancel(number)
+
+    def close(self, deadline: float) -> bool:
+        """Cancel all jobs and end the thread.
+
+        Parameters
+        ----------
+        deadline : until when to wait, on `time.monotonic`
+
+        Returns
+        -------
+        ended : if False, the thread is left to end with the process
+        """
+        self.cancel_all()
+        return end_thread(self._thread, deadline)
+
+    @Slot(int, object)
+    def _on_progressed(self, number: int, status: object) -> None:
+        if number in self._jobs:
+            self.progressed.emit(number, status)
+
+    @Slot(int, object)
+    def _on_answered(self, number: int, answer: Response) -> None:
+        job = self._jobs.pop(number, None)
+        if job is None:
+            return
+        try:
+            if answer.failure is not None:
+                job.failed(answer.failure)
+            elif not answer.cancelled:
+                job.done(answer.value)
+        finally:
+            self.busy_changed.emit(self.busy)
+            if not self._jobs:
+                self.idle.emit()

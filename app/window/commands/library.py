@@ -16,7 +16,7 @@ from app.editing.tasks import Work
 from app.window.command import EditorWindow, Menu, called, greyed, unless
 from app.window.dialogs.forms import MotionDialog, run_form
 from app.window.dialogs.questions import ask_for_name, ask_to_replace
-from app.work.long_work import as_task
+from app.work.threads import as_task
 from lcollision_core.tasks.editing import save_poses
 from lcollision_core.tasks.words import counted, menu_text
 

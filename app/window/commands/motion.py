@@ -10,7 +10,7 @@ from PySide6.QtCore import Qt
 from app.view.shading import Shading
 from app.window.command import EditorWindow, Menu, called, greyed, in_view, ticked, unless
 from app.window.dialogs.joints import JointsDialog
-from app.work.frame_cache import Onion
+from app.work.frames import Onion
 
 if TYPE_CHECKING:
     from app.editing.timeline import Timeline

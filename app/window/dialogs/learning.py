@@ -49,8 +49,7 @@ from lcollision_core.tasks.words import (
 
 if TYPE_CHECKING:
     from app.work.learning_jobs import LearnedModel
-    from app.work.long_work import LongWork
-    from app.work.threads import Failure
+    from app.work.threads import Failure, LongWork
     from lcollision_core.tasks.learning import LearnedCard
 
 STAGE_WORDS: dict[str, str] = {

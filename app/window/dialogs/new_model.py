@@ -59,8 +59,7 @@ from lcollision_core.tasks.words import (
 
 if TYPE_CHECKING:
     from app.editing.settings import Settings
-    from app.work.long_work import LongWork
-    from app.work.threads import Failure
+    from app.work.threads import Failure, LongWork
     from lcollision_core.options import LearningRequest, Quality
     from lcollision_core.tasks.sources import SourcesSummary
 

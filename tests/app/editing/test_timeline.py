@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from app.editing.document import PoseDocument
 from app.editing.tasks import Work
 from app.editing.timeline import Timeline
-from app.work.frame_cache import Onion
+from app.work.frames import Onion
 from app.work.motion_checks import MotionChecks, check_motion
 from lcollision_core.bodies import ExportRequest, NamedPose, open_body, write_poses
 from lcollision_core.files import read_mesh

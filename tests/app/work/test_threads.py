@@ -17,8 +17,7 @@ from pytestqt.qtbot import QtBot
 from app.editing.document import PoseDocument
 from app.window.garbage_collection import GarbageCollector
 from app.work.frames import FrameEvaluator, PoseFrame
-from app.work.long_work import LongWork
-from app.work.threads import Failure
+from app.work.threads import Failure, LongWork
 from lcollision_core.bodies import LearnedBody, NamedPose, sample_poses, write_poses
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
