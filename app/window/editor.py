@@ -7,6 +7,7 @@ import logging
 import os
 import socket
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -181,7 +182,6 @@ def _run(path: Path | None, model_name: str | None) -> int:
     from app.window.main_window import MainWindow
     from app.window.start_up import StartUp
     from app.work.log import start_logging
-    from app.work.threads import any_unfinished
 
     settings = Settings()
     application = make_application(settings)
@@ -191,7 +191,8 @@ def _run(path: Path | None, model_name: str | None) -> int:
     StartUp(window, path, model_name).begin()
     status = application.exec()
     AHEAD.end()
-    if any_unfinished():
+    others = set(threading.enumerate()) - {threading.main_thread()}
+    if any(not thread.daemon for thread in others):
         # All is saved; a thread that is still compiling can only be ended with the process.
         logging.shutdown()
         os._exit(status)

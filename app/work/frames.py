@@ -1,4 +1,7 @@
-"""Frames of a pose for the screen: mesh, normals, prediction and exact check."""
+"""Frames for the screen: mesh, normals, prediction and exact check of a pose.
+
+Two threads compute them: one the edited pose, the other the frames of motions, ahead of time.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, Qt, Signal, Slot
 
-from app.work.threads import Response, end_thread, guarded, started_thread
+from app.work.threads import Response, end_thread, guarded, worker_thread
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body
@@ -239,9 +242,6 @@ def _frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return array
 
 
-FloatArray = npt.NDArray[np.float64]
-
-
 @dataclass(frozen=True, eq=False)
 class CodeTarget:
     """Codes for the pose to reach, as set by sliders.
@@ -327,23 +327,16 @@ class PoseRequest:
         return "frame" if self.start is None else "motion"
 
 
-class PoseWorker(QObject):
-    """Answers requests in its own thread, with a `PoseFrame` each, or a `MeasuredFrame`."""
-
-    answered = Signal(object)
+class PoseWorker:
+    """Answers requests, with a `PoseFrame` each, or a `MeasuredFrame`; for one thread."""
 
     def __init__(self) -> None:
-        super().__init__()
         self._evaluator: FrameEvaluator | None = None
         self._start: MotionStart | None = None
         self._dragger: PoseDragger | None = None
 
-    @Slot(object)
-    def answer(self, request: PoseRequest) -> None:
-        """Answer one request, whatever happens."""
-        self.answered.emit(guarded("showing the pose", self._frame, request))
-
-    def _frame(self, request: PoseRequest) -> PoseFrame | MeasuredFrame:
+    def answer(self, request: PoseRequest) -> PoseFrame | MeasuredFrame:
+        """Answer one request."""
         evaluator = self._evaluator
         if evaluator is None or evaluator.model is not request.model:
             self._evaluator = evaluator = FrameEvaluator(request.model)
@@ -388,15 +381,14 @@ class PoseMailbox(QObject):
 
     answered = Signal(object, object)
 
-    _posted = Signal(object)
     _due = Signal()
+    _responded = Signal(object)
 
     def __init__(self, parent: QObject) -> None:
         super().__init__(parent)
-        self._worker = PoseWorker()
-        self._thread = started_thread("pose", self._worker, self)
-        self._posted.connect(self._worker.answer)
-        self._worker.answered.connect(self._on_answered)
+        self._worker, self._thread = PoseWorker(), worker_thread("pose")
+        # Emitted in that thread, and received in the window's.
+        self._responded.connect(self._on_answered)
         self._waiting: PoseRequest | None = None
         self._asked: PoseRequest | None = None
         self._is_due = False
@@ -430,7 +422,10 @@ class PoseMailbox(QObject):
         self._is_due = False
         if self._asked is None and self._waiting is not None:
             self._asked, self._waiting = self._waiting, None
-            self._posted.emit(self._asked)
+            self._thread.submit(self._answer, self._asked)
+
+    def _answer(self, request: PoseRequest) -> None:
+        self._responded.emit(guarded("showing the pose", self._worker.answer, request))
 
     def close(self, deadline: float) -> bool:
         """End the thread; see `LongWork.close`."""
@@ -473,33 +468,6 @@ class Onion:
         return [at + by for by in sorted(offsets, key=abs) if 0 <= at + by < n_frames]
 
 
-class _Worker(QObject):
-    """Computes the wanted frames until none is left."""
-
-    def __init__(self, cache: FrameCache) -> None:
-        super().__init__()
-        self._cache = cache
-        self._evaluator: FrameEvaluator | None = None
-
-    @Slot()
-    def work(self) -> None:
-        """Compute one frame after the other, always the most urgent."""
-        while (request := self._cache.next_wanted()) is not None:
-            model, motion, number, predicts = request
-            answer = guarded("showing a frame", self._frame, model, motion, number, predicts)
-            self._cache.put(model, motion, number, answer)
-
-    def _frame(self, model: Body, motion: Motion, number: int, predicts: bool) -> PoseFrame:
-        evaluator = self._evaluator
-        if evaluator is None or evaluator.model is not model:
-            self._evaluator = evaluator = FrameEvaluator(model)
-        if predicts:
-            keep_torch_to_one_thread(model)
-        evaluator.predicts = predicts
-        frame_space = motion.space(number, model.space)
-        return evaluator.frame(motion.codes[number], False, motion.placement(number), frame_space)
-
-
 class FrameCache(QObject):
     """Frames of motions by their codes and bodies, so that an edit drops no unchanged frame.
 
@@ -520,8 +488,6 @@ class FrameCache(QObject):
     ready = Signal(object, int)
     failed = Signal(object)
 
-    _due = Signal()
-
     def __init__(self, parent: QObject) -> None:
         super().__init__(parent)
         self.predicts = False
@@ -530,9 +496,8 @@ class FrameCache(QObject):
         self._frames: dict[_Key, PoseFrame] = {}
         self._n_bytes = 0
         self._wanted: list[tuple[Motion, int]] = []
-        self._worker = _Worker(self)
-        self._thread = started_thread("frames", self._worker, self)
-        self._due.connect(self._worker.work)
+        self._evaluator: FrameEvaluator | None = None
+        self._thread = worker_thread("frames")
 
     def forget(self, model: Body | None) -> None:
         """Clear the cache and start with another model."""
@@ -552,10 +517,29 @@ class FrameCache(QObject):
             self._wanted = [frame for frame in wanted if self._get(*frame) is None]
             is_due = bool(self._wanted)
         if is_due:
-            self._due.emit()
+            self._thread.submit(self._work)
 
-    def next_wanted(self) -> tuple[Body, Motion, int, bool] | None:
-        """Return the next frame for the worker to compute; None if nothing is left."""
+    # In the other thread.
+
+    def _work(self) -> None:
+        """Compute the wanted frames, always the most urgent, until none is left."""
+        while (request := self._next_wanted()) is not None:
+            model, motion, number, predicts = request
+            answer = guarded("showing a frame", self._frame, model, motion, number, predicts)
+            self._put(model, motion, number, answer)
+
+    def _frame(self, model: Body, motion: Motion, number: int, predicts: bool) -> PoseFrame:
+        evaluator = self._evaluator
+        if evaluator is None or evaluator.model is not model:
+            self._evaluator = evaluator = FrameEvaluator(model)
+        if predicts:
+            keep_torch_to_one_thread(model)
+        evaluator.predicts = predicts
+        frame_space = motion.space(number, model.space)
+        return evaluator.frame(motion.codes[number], False, motion.placement(number), frame_space)
+
+    def _next_wanted(self) -> tuple[Body, Motion, int, bool] | None:
+        """Return the next frame to compute; None if nothing is left."""
         with self._guard:
             while self._wanted:
                 motion, number = self._wanted.pop(0)
@@ -563,7 +547,7 @@ class FrameCache(QObject):
                     return self._model, motion, number, self.predicts
         return None
 
-    def put(self, model: Body, motion: Motion, number: int, answer: Response) -> None:
+    def _put(self, model: Body, motion: Motion, number: int, answer: Response) -> None:
         """Store a computed frame, and drop the least recently used ones beyond the limit."""
         frame: PoseFrame | None = answer.value
         with self._guard:

@@ -7,10 +7,11 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any
 
-from PySide6.QtCore import QObject, QThread, QTimer, Signal, Slot
+from PySide6.QtCore import QObject, QTimer, Signal, Slot
 
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import Job, at_most_every
@@ -52,35 +53,22 @@ class Response:
     cancelled: bool = False
 
 
-def started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
-    """Move a worker, which has no parent, into a new thread."""
+def worker_thread(name: str) -> ThreadPoolExecutor:
+    """Return an executor with one thread, which runs calls one after the other."""
     sys.setswitchinterval(_SWITCH_SECONDS)
-    thread = QThread(parent)
-    thread.setObjectName(name)
-    worker.moveToThread(thread)
-    thread.start()
-    return thread
+    return ThreadPoolExecutor(1, name)
 
 
-def end_thread(thread: QThread, deadline: float) -> bool:
-    """End a thread after its current work; return whether it has ended by the deadline.
+def end_thread(thread: ThreadPoolExecutor, deadline: float) -> bool:
+    """End a thread after the calls submitted so far; return whether it has ended in time.
 
-    An unfinished thread, as during the first compiling, is kept alive: destroying it aborts Qt.
+    Parameters
+    ----------
+    deadline : until when to wait, on `time.monotonic`
     """
-    thread.quit()
-    ended = thread.wait(max(1, int(1000 * (deadline - time.monotonic()))))
-    if not ended:
-        thread.setParent(None)
-        _unfinished.append(thread)
-    return ended
-
-
-_unfinished: list[QThread] = []
-
-
-def any_unfinished() -> bool:
-    """Return whether a thread that missed its deadline in `end_thread` still runs."""
-    return any(not thread.isFinished() for thread in _unfinished)
+    last = thread.submit(time.monotonic)
+    thread.shutdown(wait=False)
+    return bool(wait([last], max(0.001, deadline - time.monotonic())).done)
 
 
 def single_shot(parent: QObject, milliseconds: int, slot: Callable[[], object]) -> QTimer:
@@ -123,44 +111,13 @@ _PROGRESS_SECONDS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class JobRequest:
-    """Long work on a snapshot.
+class _Started:
+    """A job that has not ended; see `LongWork.start`."""
 
-    Attributes
-    ----------
-    request_id : rises from job to job
-    label : as in "Opening poses.json"
-    work : called in the worker's thread
-    job : cancels the work
-    done, failed : called in the window's thread with the work's value, or with its `Failure`
-    """
-
-    request_id: int
     label: str
-    work: Task
     job: Job
     done: Callable[[Any], None]
     failed: Callable[[Failure], None]
-
-
-class LongWorker(QObject):
-    """Runs one job after the other, in its own thread."""
-
-    answered = Signal(int, object)
-    progressed = Signal(int, object)
-
-    @Slot(object)
-    def answer(self, job: JobRequest) -> None:
-        """Run one job; its errors become its response."""
-        self.answered.emit(job.request_id, guarded(job.label, self._value, job))
-
-    def _value(self, job: JobRequest) -> object:
-        job.job.check()
-
-        def report(*status: Any) -> None:
-            self.progressed.emit(job.request_id, status[0] if len(status) == 1 else status)
-
-        return job.work(job.job.part(at_most_every(_PROGRESS_SECONDS, report)))
 
 
 class LongWork(QObject):
@@ -179,16 +136,16 @@ class LongWork(QObject):
     progressed = Signal(int, object)
     failed = Signal(object)
 
-    _wanted = Signal(object)
+    _reported = Signal(int, object)
+    _answered = Signal(int, object)
 
     def __init__(self, parent: QObject | None = None, name: str = "long work") -> None:
         super().__init__(parent)
-        self._worker = LongWorker()
-        self._thread = started_thread(name, self._worker, self)
-        self._wanted.connect(self._worker.answer)
-        self._worker.answered.connect(self._on_answered)
-        self._worker.progressed.connect(self._on_progressed)
-        self._jobs: dict[int, JobRequest] = {}
+        self._thread = worker_thread(name)
+        # Emitted in that thread, and received in the window's.
+        self._reported.connect(self._on_reported)
+        self._answered.connect(self._on_answered)
+        self._jobs: dict[int, _Started] = {}
         self._last_id = 0
 
     @property
@@ -222,12 +179,23 @@ class LongWork(QObject):
         number : of the job
         """
         self._last_id += 1
-        on_failure = self.failed.emit if failed is None else failed
-        job = JobRequest(self._last_id, label, work, Job(), done, on_failure)
-        self._jobs[job.request_id] = job
-        self._wanted.emit(job)
+        number, job = self._last_id, Job()
+        self._jobs[number] = _Started(label, job, done, failed or self.failed.emit)
+        self._thread.submit(self._run, number, label, work, job)
         self.busy_changed.emit(self.busy)
-        return job.request_id
+        return number
+
+    def _run(self, number: int, label: str, work: Task, job: Job) -> None:
+        """Run a job in the other thread; its errors become its response."""
+
+        def report(*status: Any) -> None:
+            self._reported.emit(number, status[0] if len(status) == 1 else status)
+
+        def run() -> object:
+            job.check()
+            return work(job.part(at_most_every(_PROGRESS_SECONDS, report)))
+
+        self._answered.emit(number, guarded(label, run))
 
     def cancel(self, number: int) -> None:
         """Stop a job, which signals nothing more. Does nothing if it is done."""
@@ -242,21 +210,12 @@ class LongWork(QObject):
             self.cancel(number)
 
     def close(self, deadline: float) -> bool:
-        """Cancel all jobs and end the thread.
-
-        Parameters
-        ----------
-        deadline : until when to wait, on `time.monotonic`
-
-        Returns
-        -------
-        ended : if False, the thread is left to end with the process
-        """
+        """Cancel all jobs and end the thread; see `end_thread`."""
         self.cancel_all()
         return end_thread(self._thread, deadline)
 
     @Slot(int, object)
-    def _on_progressed(self, number: int, status: object) -> None:
+    def _on_reported(self, number: int, status: object) -> None:
         if number in self._jobs:
             self.progressed.emit(number, status)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PySide6.QtCore import QPoint, Qt, QThread, QTimer
+from PySide6.QtCore import QPoint, Qt, QTimer
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
     QApplication,
@@ -428,7 +429,7 @@ def noting(threads: list[str], work: Callable[..., Any]) -> Callable[..., Any]:
     """Return a wrapper that records the thread's name if it is one of the program's threads."""
 
     def noted(*arguments: Any, **options: Any) -> Any:
-        threads.append(QThread.currentThread().objectName())
+        threads.append(threading.current_thread().name.partition("_")[0])
         return work(*arguments, **options)
 
     return noted
