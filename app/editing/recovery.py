@@ -1,6 +1,7 @@
 """Recovery after a crash: unsaved edits are written every few seconds and found at the next start.
 
-They are the pose and, if it is a frame of a motion, the changed frames of the motions.
+They are the pose and, if it is a frame of a motion, the changed frames of the motions: the rest
+comes from the file that the motions were read from, as long as that file has not changed.
 
 Each editor has a session, a folder below `sessions_folder`, locked for as long as its process
 runs. However the process ends, the lock ends with it, and the next editor that starts can take
@@ -9,31 +10,39 @@ over the session. It never takes over a session that another running editor hold
 
 from __future__ import annotations
 
+import base64
 import errno
 import json
 import logging
 import shutil
 import time
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from PySide6.QtCore import QLockFile, QObject, Signal, Slot
 
 from app.editing.document import PoseDocument
-from app.work.kept_motions import KEY, EditedMotions, to_json_values, unreadable_reason
+from app.editing.history import Source
+from app.editing.timeline import EditedMotions
+from app.work.preparing import open_poses_to_show, open_to_show
 from app.work.threads import Failure, LongWork, Task, guarded, single_shot
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import atomic_write
 from lcollision_core.files.safe import read_regular, require_regular
 from lcollision_core.jobs import Job
-from lcollision_core.json_values import parse_json
+from lcollision_core.json_values import from_json, parse_json, to_json
+from lcollision_core.tasks.opening import OpenedModel, ReadPoses, own_motions, read_motions
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import Body, NamedPose
+    from lcollision_core.bodies import Body, NamedPose, OtherModelError
     from lcollision_core.files import FileStamp
+    from lcollision_core.motion import Motion
+
 
 _log = logging.getLogger(__name__)
 
@@ -200,10 +209,12 @@ class Autosave(QObject):
     -------
     failed : Failure, emitted once until writing works again
     written : after each write
+    recovered : `recover` has loaded a pose
     """
 
     failed = Signal(object)
     written = Signal()
+    recovered = Signal()
 
     def __init__(
         self,
@@ -214,7 +225,6 @@ class Autosave(QObject):
         super().__init__(document)
         self._document = document
         self._told = False
-        self._recovering: RecoverablePose | None = None
         self._session: Session | None = None
         try:
             self._session = Session.new(parent_folder or sessions_folder())
@@ -234,15 +244,17 @@ class Autosave(QObject):
         ):
             changed.connect(self._on_changed)
         document.history.modified_changed.connect(self._on_modified_changed)
-        document.tasks.recovered.connect(self._on_recovered)
 
     def recover(self, lost: RecoverablePose) -> None:
         """Load a lost pose into the document, unsaved, and continue its session.
 
         If its model is gone, emit `PoseDocument.failed` and leave the session unchanged.
         """
-        self._recovering = lost
-        self._document.tasks.recover(lost.poses_file, lost.model, lost.pose_name, lost.file)
+        document = self._document
+        model = document.model if lost.model == document.history.model_file else None
+        work = partial(read_lost, model, lost.model, lost.poses_file)
+        done = partial(self._on_read, lost)
+        document.tasks.start_loading(f"Recovering {lost.pose_name}", work, done)
 
     def close(self, timeout: float = 5.0, keep: bool = False) -> bool:
         """Stop, and discard unsaved edits unless they are kept for the next start.
@@ -310,19 +322,34 @@ class Autosave(QObject):
             document.timeline.edits(),
         )
 
-    @Slot(object, object)
-    def _on_recovered(self, poses_file: Path, motions: EditedMotions | None) -> None:
-        lost = self._recovering
-        if lost is not None and lost.poses_file == poses_file:
-            self._recovering = None
-            if self._session is not None:
-                self._session.discard()
-            self._session = lost.session
-            self._document.history.file_stamp = lost.file_stamp
-            for domain in range(len(self._document.model.domain_names)):
-                self._document.motion.set_locked(domain, domain in lost.locked)
-            if motions is not None:
-                self._document.timeline.restore(motions)
+    def _on_read(
+        self,
+        lost: RecoverablePose,
+        found: tuple[ReadPoses | OtherModelError, EditedMotions | Failure | None],
+    ) -> None:
+        (read, motions), document, history = found, self._document, self._document.history
+        if isinstance(read, LCollisionError):
+            document.failed.emit(Failure.of(read))
+            return
+        if read.opened is not None:
+            document.tasks.model_opened.emit(read.opened)
+        poses = read.content.poses
+        same_name = (pose for pose in poses if pose.name == lost.pose_name)
+        edited = read.content.working or next(same_name, poses[0])
+        history.begin_with(edited, Source.FILE, lost.file, poses)
+        history.file_stamp = lost.file_stamp
+        history.mark_unsaved()
+        if self._session is not None:
+            self._session.discard()
+        self._session = lost.session
+        for domain in range(len(document.model.domain_names)):
+            document.motion.set_locked(domain, domain in lost.locked)
+        if isinstance(motions, EditedMotions):
+            document.timeline.restore(motions)
+        self.recovered.emit()
+        document.message.emit(f"Recovered {edited.name}")
+        if isinstance(motions, Failure):
+            document.failed.emit(motions)
 
     def _on_written(self, is_kept: bool) -> None:
         if is_kept:
@@ -379,3 +406,179 @@ def _delete(folder: Path, _: Job) -> bool:
     for name in (_POSES, _SESSION):
         (folder / name).unlink(missing_ok=True)
     return False
+
+
+FloatArray = npt.NDArray[np.float64]
+
+KEY = "motions"
+"""Key of the edits in the poses file of a session."""
+
+MOST_BYTES = 2**24
+"""Size limit of the kept codes: about 20 000 frames of 100 codes."""
+
+
+@dataclass(frozen=True)
+class _KeptMotion:
+    """The changes of one motion: `codes` are the rows of `frames`, float64 as base64."""
+
+    name: str
+    shape: tuple[int, int]
+    frames: tuple[int, ...]
+    codes: str
+    is_saved: bool
+
+
+@dataclass(frozen=True)
+class _StoredMotions:
+    """`EditedMotions` as stored in a file."""
+
+    file: str
+    stamp: tuple[int, int, int, int] | None
+    open: str
+    frame: int
+    motions: tuple[_KeptMotion, ...]
+
+
+def to_json_values(motions: EditedMotions) -> dict[str, Any]:
+    """Return edited motions as JSON values for a file.
+
+    Raises
+    ------
+    LCollisionError : the codes exceed `MOST_BYTES`.
+    """
+    kept_frames, n_bytes = [], 0
+    for name, now in motions.edited.items():
+        changed = np.flatnonzero((now.codes != motions.read[name].codes).any(axis=1))
+        codes = now.codes[changed].astype("<f8").tobytes()
+        n_bytes += len(codes)
+        if n_bytes > MOST_BYTES:
+            what = f"has edits of more than {MOST_BYTES >> 20} MiB, which autosave doesn't keep"
+            raise LCollisionError(what, "export the motion", where=f"the motion “{motions.open}”")
+        shape = len(now), now.codes.shape[1]
+        text = base64.b64encode(codes).decode()
+        kept_frames.append(
+            _KeptMotion(name, shape, tuple(changed.tolist()), text, name in motions.saved)
+        )
+    file, stamp = str(motions.file.absolute()), motions.stamp
+    return to_json(_StoredMotions(file, stamp, motions.open, motions.frame, tuple(kept_frames)))
+
+
+def read_lost(
+    model: Body | None,
+    model_file: str,
+    path: Path,
+    job: Job,
+) -> tuple[ReadPoses | OtherModelError, EditedMotions | Failure | None]:
+    """Read the poses and motions that a crash left.
+
+    Parameters
+    ----------
+    model, model_file, path : see `open_poses`
+
+    Returns
+    -------
+    read, motions : the motions are None if there are none, or the Failure that lost them
+    """
+    stored = _stored_motions(path)
+    opened = _opened_in_shape(model, model_file, stored, job)
+    if opened is not None:
+        model = opened.model
+    read = open_poses_to_show(model, model_file, path, job)
+    if opened is not None and isinstance(read, ReadPoses):
+        read = replace(read, opened=opened)
+    body = read.opened.model if isinstance(read, ReadPoses) and read.opened else model
+    if body is None or isinstance(read, LCollisionError):
+        return read, None
+    try:
+        return read, _motions(body, stored, job)
+    except LCollisionError as error:
+        return read, Failure.of(error)
+
+
+def _stored_motions(path: Path) -> Any:
+    """Return what a file of poses stores of the motions; None if it stores none or is damaged."""
+    from lcollision_core.bodies.poses import MAX_FILE_BYTES
+
+    try:
+        document = parse_json(read_regular(path, MAX_FILE_BYTES))
+    except (OSError, ValueError):
+        # Reading the poses reports it.
+        return None
+    return document.get(KEY) if isinstance(document, dict) else None
+
+
+def _opened_in_shape(
+    model: Body | None,
+    model_file: str,
+    stored: Any,
+    job: Job,
+) -> OpenedModel | None:
+    """Return the body in the shape that the kept motion's file gives; None if it gives none."""
+    from lcollision_core.bodies.motions import body_of_motion
+    from lcollision_core.files.motion.smpl import is_smpl_motion
+
+    file = stored.get("file") if isinstance(stored, dict) else None
+    if not isinstance(file, str) or not is_smpl_motion(file):
+        return None
+    body = model or open_to_show(model_file, job).model
+    return OpenedModel(body_of_motion(body, Path(file))[0], model_file)
+
+
+def _motions(body: Body, document: Any, job: Job) -> EditedMotions | None:
+    if document is None:
+        return None
+    try:
+        stored = from_json(_StoredMotions, document, "the motion")
+    except ValueError as error:
+        raise _lost("the motion", str(error)) from error
+    file, name = Path(stored.file), f"“{stored.open}”"
+    why = unreadable_reason(file, stored.stamp)
+    if why:
+        raise _lost(name, why)
+    own_file = own_motions(body)[0]
+    is_own = own_file is not None and own_file.absolute() == file.absolute()
+    clip_names = [motion.name for motion in stored.motions] if is_own else [None]
+    read_one = partial(read_motions, body, own_file if is_own and own_file else file, job=job)
+    try:
+        read = {motion.name: motion for clip in clip_names for motion in read_one(clip)}
+    except LCollisionError as error:
+        raise _lost(name, error.headline) from error
+    edited = {}
+    for kept_motion in stored.motions:
+        was = read.get(kept_motion.name)
+        if was is None or was.codes.shape != kept_motion.shape or not 0 <= stored.frame < len(was):
+            raise _lost(name, f"{file.name} has other frames than before")
+        edited[kept_motion.name] = (
+            replace(was, codes=_codes(was, kept_motion)) if kept_motion.frames else was
+        )
+    if stored.open not in edited:
+        raise _lost(name, "its edits are not among those that were kept")
+    saved = frozenset(kept_motion.name for kept_motion in stored.motions if kept_motion.is_saved)
+    return EditedMotions(file, stored.stamp, stored.open, stored.frame, read, edited, saved)
+
+
+def _codes(was: Motion, kept: _KeptMotion) -> FloatArray:
+    codes, frames = np.array(was.codes), np.array(kept.frames, dtype=np.intp)
+    try:
+        rows = np.frombuffer(base64.b64decode(kept.codes, validate=True), "<f8")
+        if len(frames) and not (frames.min() >= 0 and frames.max() < len(was)):
+            raise ValueError("a frame is beyond its end")
+        codes[frames] = rows.reshape(len(frames), codes.shape[1])
+    except ValueError as error:
+        raise _lost(f"“{kept.name}”", f"what was kept is damaged ({error})") from error
+    return codes
+
+
+def unreadable_reason(file: Path, stamp: FileStamp | None) -> str:
+    """Return why motions cannot be read from a file again, or "" if it is unchanged."""
+    from lcollision_core.files import file_stamp
+
+    now = file_stamp(file)
+    if now is None:
+        return f"{file.name} is gone"
+    return "" if now == stamp else f"{file.name} was changed since"
+
+
+def _lost(motion: str, why: str) -> LCollisionError:
+    what = f"can't be recovered, as {why}; its frame is recovered as a pose"
+    return LCollisionError(what, where=f"The edits of {motion}")

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
 
 from app.editing.history import Source, named_after, read_only
-from app.work.kept_motions import EditedMotions, read_lost
 from app.work.preparing import open_poses_to_show, open_to_show, prepare, ready
 from app.work.threads import Failure, LongWork, Task, as_task
 from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
@@ -97,7 +96,6 @@ class Tasks(QObject):
     imported : Path, the mesh that has become the pose
     of_other_model : OtherModelError, if a poses file needs another known model
     wrong_scale : Path and WrongScaleError, if a mesh to import is in another unit
-    recovered : Path, the poses file that `recover` has loaded, and its EditedMotions or None
     contacts_counted : ContactsAtRest
     pairs_proposed : dict of tuples of ProposedPair, by kind of group
     rules_proposed : `proposed_rules` is new
@@ -117,7 +115,6 @@ class Tasks(QObject):
     imported = Signal(object)
     of_other_model = Signal(object)
     wrong_scale = Signal(object, object)
-    recovered = Signal(object, object)
     contacts_counted = Signal(object)
     pairs_proposed = Signal(object)
     rules_proposed = Signal()
@@ -399,12 +396,6 @@ class Tasks(QObject):
         work = partial(open_poses_to_show, body, model_file or "", Path(path))
         self.start_loading(f"Opening {Path(path).name}", work, self._on_poses)
 
-    def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
-        """Restore the pose that a crash left, see `RecoverablePose`, unsaved."""
-        model = self._model if model_file == self._history.model_file else None
-        work = partial(read_lost, model, model_file, poses_file)
-        self.start_loading(f"Recovering {name}", work, partial(self._on_recovered, name, file))
-
     def save(self, path: str | Path | None = None) -> None:
         """Write the working pose and the file's other poses, and mark the pose as saved.
 
@@ -583,30 +574,6 @@ class Tasks(QObject):
         history.amend(replace(history.state, outcome=None))
         self.model_exchanged.emit(changed)
         self.message.emit(told)
-
-    def _on_recovered(
-        self,
-        name: str,
-        file: Path | None,
-        lost: tuple[ReadPoses | OtherModelError, EditedMotions | Failure | None],
-    ) -> None:
-        read, motions = lost
-        if isinstance(read, LCollisionError):
-            self.failed.emit(Failure.of(read))
-            return
-        if read.opened is not None:
-            self.model_opened.emit(read.opened)
-        poses = read.content.poses
-        edited = read.content.working or next((p for p in poses if p.name == name), poses[0])
-        self._history.begin_with(edited, Source.FILE, file, poses)
-        # Unknown, so that Save asks, until the session gives it.
-        self._history.file_stamp = None
-        self._history.mark_unsaved()
-        is_whole = not isinstance(motions, Failure)
-        self.recovered.emit(read.path, motions if is_whole else None)
-        self.message.emit(f"Recovered {edited.name}")
-        if isinstance(motions, Failure):
-            self.failed.emit(motions)
 
     def _on_encoded(self, path: Path, pose: NamedPose | WrongScaleError) -> None:
         if isinstance(pose, WrongScaleError):

@@ -16,7 +16,6 @@ from PySide6.QtCore import QObject, Qt, QTimer, Signal, Slot
 from app.editing.history import DocumentState, Moment
 from app.editing.tasks import Work
 from app.work.frames import FrameCache, Onion
-from app.work.kept_motions import EditedMotions
 from app.work.motion_checks import MotionChecks, check_motion, path_of_vertex
 from app.work.preparing import open_motions_to_show
 from app.work.threads import LongWork
@@ -266,6 +265,29 @@ class MotionResolve(QObject):
         if self.progress is not None and not self.runs:
             self.progress = None
             self.changed.emit()
+
+
+@dataclass(frozen=True, eq=False)
+class EditedMotions:
+    """Motions of one file with changed frames.
+
+    Attributes
+    ----------
+    file : that they were read from
+    stamp : of the file at that time, None if it did not exist
+    open : the name of the motion on the timeline
+    frame : the playhead
+    read, edited : as read, and as edited; by the same names
+    saved : names of the motions exported since their last edit
+    """
+
+    file: Path
+    stamp: FileStamp | None
+    open: str
+    frame: int
+    read: Mapping[str, Motion]
+    edited: Mapping[str, Motion]
+    saved: frozenset[str]
 
 
 AHEAD = 24

@@ -89,12 +89,13 @@ class StartUp(QObject):
     def _on_model(self) -> None:
         from app.editing.recovery import Autosave
 
-        self._window.set_autosave(Autosave(self._document))
+        autosave = Autosave(self._document)
+        self._window.set_autosave(autosave)
         # Wait until the document has loaded its own pose.
         QTimer.singleShot(0, self, self._on_first_pose)
         # Frame the first pose only: later ones keep the user's camera.
         self._document.history.pose_loaded.connect(self._window.viewport.frame_pose, _ONCE)
-        self._document.tasks.recovered.connect(self._window.viewport.frame_pose)
+        autosave.recovered.connect(self._window.viewport.frame_pose)
         self._window.ready.connect(self._on_ready)
 
     @Slot()

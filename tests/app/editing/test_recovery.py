@@ -142,7 +142,7 @@ def test_a_killed_editor_loses_nothing_that_was_written(
     assert find_recoverable_poses(folder) == []
 
     autosave = Autosave(document, folder, seconds=0.05)
-    with qtbot.waitSignal(document.tasks.recovered, timeout=20_000):
+    with qtbot.waitSignal(autosave.recovered, timeout=20_000):
         autosave.recover(lost)
     assert document.history.latent[2] == 0.625
     assert document.motion.locked_domains == {1}
@@ -213,7 +213,7 @@ def test_the_poses_of_the_file_are_recovered_beside_the_working_pose(
     document.new_pose()
     (lost,) = find_recoverable_poses(folder)
     autosave = Autosave(document, folder, seconds=1000.0)
-    with qtbot.waitSignal(document.tasks.recovered):
+    with qtbot.waitSignal(autosave.recovered):
         autosave.recover(lost)
     assert document.history.latent.tobytes() == working
     assert document.history.pose.name == "a"
@@ -250,7 +250,7 @@ def test_save_after_a_recovery_sees_that_another_program_wrote_the_file(
         session.write_text(json.dumps(held))
     (lost,) = find_recoverable_poses(folder)
     autosave = Autosave(document, folder, seconds=1000.0)
-    with qtbot.waitSignal(document.tasks.recovered):
+    with qtbot.waitSignal(autosave.recovered):
         autosave.recover(lost)
     assert document.history.file == path
     assert document.history.file_changed_elsewhere == (end != "untouched")
@@ -402,7 +402,7 @@ def test_a_killed_editor_loses_no_edit_of_a_motion(
     assert lost.poses_file.stat().st_size < 100_000
 
     autosave = Autosave(document, folder, seconds=1000.0)
-    with qtbot.waitSignal(document.tasks.recovered):
+    with qtbot.waitSignal(autosave.recovered):
         autosave.recover(lost)
     timeline = document.timeline
     motion, read = timeline.motion, timeline.original
@@ -445,7 +445,7 @@ def test_edits_of_several_clips_are_recovered_with_what_was_exported(
     document.new_pose()
     (lost,) = find_recoverable_poses(tmp_path / "sessions")
     autosave = Autosave(document, tmp_path / "sessions", seconds=1000.0)
-    with qtbot.waitSignal(document.tasks.recovered):
+    with qtbot.waitSignal(autosave.recovered):
         autosave.recover(lost)
     assert {now.name: now.codes.tobytes() for _, now in timeline.changes} == {
         CLIP: first.codes.tobytes(),
@@ -474,7 +474,7 @@ def test_the_motion_of_a_scene_is_recovered_though_another_body_is_open_since(
     opened(qtbot, document, swing)
     (lost,) = find_recoverable_poses(tmp_path / "sessions")
     autosave = Autosave(document, tmp_path / "sessions", seconds=1000.0)
-    with qtbot.waitSignal(document.tasks.recovered):
+    with qtbot.waitSignal(autosave.recovered):
         autosave.recover(lost)
     scene = as_scene(document.model)
     assert scene is not None
@@ -552,7 +552,7 @@ def test_edits_beyond_the_bound_are_told_of_and_the_pose_is_kept(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("app.work.kept_motions.MOST_BYTES", 100)
+    monkeypatch.setattr("app.editing.recovery.MOST_BYTES", 100)
     opened(qtbot, document, swing)
     autosave = Autosave(document, tmp_path / "sessions", seconds=0.05)
     with qtbot.waitSignal(autosave.failed) as failed:

@@ -196,11 +196,12 @@ def test_poses_of_a_character_are_saved_and_recovered_with_it(
     (lost,) = find_recoverable_poses(tmp_path / "sessions")
     after = PoseDocument(open_body(arm_file), library_folder=tmp_path / "library")
     assert [pose.name for pose in after.library.poses] == ["bent"]
-    with qtbot.waitSignal(after.tasks.recovered, timeout=PATIENCE):
-        after.tasks.recover(lost.poses_file, lost.model, lost.pose_name, lost.file)
+    autosave = Autosave(after, tmp_path / "sessions", seconds=1000.0)
+    with qtbot.waitSignal(autosave.recovered, timeout=PATIENCE):
+        autosave.recover(lost)
     assert after.history.latent[code] == pytest.approx(0.5)
     assert Path(after.history.model_file) == arm_file
-    lost.session.discard()
+    assert autosave.close()
     assert after.close()
     after.deleteLater()
 

@@ -152,7 +152,9 @@ def test_a_killed_editor_s_pose_is_offered_at_the_next_start(
     window.show()
     start_up = StartUp(window, None, str(model_file))
     timer = answer(recover)
-    with qtbot.waitSignal(document.tasks.recovered, timeout=PATIENCE):
+    with qtbot.waitSignal(
+        document.message, timeout=PATIENCE, check_params_cb=lambda text: "Recovered" in text
+    ):
         start_up.begin()
     timer.stop()
     # It looks out for signals until the process ends.

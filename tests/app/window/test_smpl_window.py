@@ -50,7 +50,7 @@ def test_a_motion_shapes_the_body_and_comes_back(
     assert document.model.fingerprint == plain.fingerprint
     (lost,) = find_recoverable_poses(sessions)
     autosave = Autosave(document, sessions, seconds=1000.0)
-    with qtbot.waitSignal(document.tasks.recovered, timeout=PATIENCE):
+    with qtbot.waitSignal(autosave.recovered, timeout=PATIENCE):
         autosave.recover(lost)
     assert autosave.close()
     assert timeline.motion.codes.tobytes() == codes.tobytes()
