@@ -14,7 +14,7 @@ from app.window.dialogs.learning import STAGE_WORDS, LearningDialog
 from app.window.dialogs.new_model import NewModelDialog
 from app.window.file_actions import FileActions
 from app.window.widgets import plain_tip, restyle
-from app.work import learning_jobs
+from app.work import learning_runs
 from app.work.learning_runs import LearningRun, LearningRuns
 from app.work.threads import LongWork
 from lcollision_core.learning_state import RunState
@@ -167,7 +167,7 @@ class LearningActions(QObject):
         if not self._began:
             self._began = True
             # Load in a worker: the imports take longer than a frame.
-            work = learning_jobs.load_learning
+            work = learning_runs.load_learning
             self._work.start("Looking for runs", work, lambda _: self.runs.start_polling())
 
     @Slot()

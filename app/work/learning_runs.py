@@ -16,12 +16,17 @@ from PySide6.QtCore import QObject, QProcess, QProcessEnvironment, QTimer, Signa
 import app
 from app.work.learner import DISCARD, STOP, WANTED
 from lcollision_core.errors import LCollisionError
+from lcollision_core.jobs import Job
 from lcollision_core.learning_state import RunState
 
 if TYPE_CHECKING:
+    from lcollision_core.bodies import LearnedBody
     from lcollision_core.learning_state import LearningStatus
     from lcollision_core.options import LearningRequest
+    from lcollision_core.tasks.learning import LearnedCard
+    from lcollision_core.tasks.sources import SourcesSummary
     from lcollision_core.tasks.work_folder import WorkFolder
+
 
 LEARNER = (sys.executable, "-P", "-m", "app.work.learner")
 """The learning program and its arguments before the work folder; -P skips the current folder."""
@@ -279,3 +284,37 @@ def _environment() -> QProcessEnvironment:
         python_path = environment.value("PYTHONPATH")
         environment.insert("PYTHONPATH", os.pathsep.join(filter(None, (str(root), python_path))))
     return environment
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedModel:
+    """A learned model and its figures."""
+
+    model: LearnedBody
+    card: LearnedCard
+
+
+def load_learning(_: Job) -> None:
+    """Import the modules for looking at runs, which takes longer than a frame."""
+    import lcollision_core.tasks.learning  # noqa: F401
+
+
+def look_into_sources(paths: tuple[Path, ...], job: Job) -> SourcesSummary:
+    """Summarise the files that a model is to be learned from.
+
+    Raises
+    ------
+    LCollisionError : nothing can be learned from them.
+    """
+    from lcollision_core.tasks.sources import summarise_sources
+
+    return summarise_sources(paths, job)
+
+
+def read_card(model_file: str, _: Job) -> LearnedModel:
+    """Read a learned model and its figures."""
+    from lcollision_core.bodies import LearnedBody
+    from lcollision_core.tasks.learning import card_of
+
+    model = LearnedBody.load(model_file)
+    return LearnedModel(model, card_of(model, model_file))

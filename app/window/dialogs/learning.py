@@ -34,7 +34,7 @@ from app.window.widgets import (
     swatch_icon,
     vbox,
 )
-from app.work import learning_jobs
+from app.work import learning_runs
 from app.work.learning_runs import LearningRun, LearningRuns
 from lcollision_core.learning_state import RunState, Stage
 from lcollision_core.tasks.words import (
@@ -48,7 +48,7 @@ from lcollision_core.tasks.words import (
 )
 
 if TYPE_CHECKING:
-    from app.work.learning_jobs import LearnedModel
+    from app.work.learning_runs import LearnedModel
     from app.work.threads import Failure, LongWork
     from lcollision_core.tasks.learning import LearnedCard
 
@@ -236,7 +236,7 @@ class LearningDialog(QDialog):
         if is_done and run.path not in (self._card_of, self._read_for):
             self._work.cancel(self._reading)
             self._read_for = run.path
-            read = partial(learning_jobs.read_card, run.status.model)
+            read = partial(learning_runs.read_card, run.status.model)
             done = partial(self._on_card, run.path)
             self._reading = self._work.start("Reading the model", read, done, self._on_no_card)
         if self._shown != (run.path, state, collides):

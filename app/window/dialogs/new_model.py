@@ -47,7 +47,7 @@ from app.window.widgets import (
     scrolling,
     vbox,
 )
-from app.work import learning_jobs
+from app.work import learning_runs
 from lcollision_core.tasks.words import (
     counted,
     duration_text,
@@ -748,7 +748,7 @@ class NewModelDialog(QDialog):
         self.preview.tell(f"Reading {counted(len(paths), 'file')}…" if paths else _EMPTY)
         self._on_changed()
         if paths:
-            work = partial(learning_jobs.look_into_sources, paths)
+            work = partial(learning_runs.look_into_sources, paths)
             self._reading = self._work.start("Reading files", work, self._on_read, self._on_unread)
 
     @Slot()

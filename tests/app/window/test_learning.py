@@ -23,7 +23,7 @@ from app.view.theme import DARK, LIGHT, Theme, apply_theme
 from app.window.dialogs.learning import LearningDialog, _figures
 from app.window.dialogs.new_model import NewModelDialog
 from app.window.main_window import MainWindow
-from app.work import learning_jobs, learning_runs
+from app.work import learning_runs
 from lcollision_core.bodies import LearnedBody, RigBody, model_destination
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import locked, write_mesh, write_pose_set
@@ -349,7 +349,7 @@ def test_a_card_that_is_being_read_is_given_up_with_its_dialog_and_for_another_r
         asked.acquire(timeout=120.0)
         return model_file
 
-    monkeypatch.setattr(learning_jobs, "read_card", read)
+    monkeypatch.setattr(learning_runs, "read_card", read)
     monkeypatch.setattr(
         LearningDialog, "_on_card", lambda _, path, model: shown.append((path, model))
     )
@@ -433,7 +433,7 @@ def test_a_failure_to_look_for_runs_is_told(
     def fail(*_: object) -> None:
         raise LCollisionError("cannot be read", "free some memory", where="the list of runs")
 
-    monkeypatch.setattr(learning_jobs, "load_learning", fail)
+    monkeypatch.setattr(learning_runs, "load_learning", fail)
     with qtbot.waitSignal(document.failed, timeout=PATIENCE) as failed:
         window = open_window(qtbot, document, settings_in(tmp_path))
     assert failed.args[0].headline == "the list of runs cannot be read"
