@@ -8,9 +8,8 @@ from PySide6.QtCore import QObject, QPoint, Qt, Slot
 from PySide6.QtWidgets import QMenu
 
 from app.view.shading import Shading
-from app.window.clipboard import copy_pose, paste_pose
 from app.window.command import EditorWindow
-from app.window.commands.edit import edit_parts
+from app.window.commands.edit import copy_pose, edit_parts, paste_pose
 from app.window.widgets import ListMenu
 from lcollision_core.tasks.words import heading, menu_text
 

@@ -26,9 +26,8 @@ if TYPE_CHECKING:
     from app.window.dialogs.help import Shortcut
     from app.window.file_actions import FileActions
     from app.window.hidden_meshes import HiddenMeshes
-    from app.window.layout import Layout
+    from app.window.layout import Layout, Panel
     from app.window.learning_actions import LearningActions
-    from app.window.panels.dock import Panel
     from app.window.panels.library import LibraryPanel
     from app.window.panels.sliders import RandomiseRow, SlidersPanel
     from app.window.panels.timeline import TimelinePanel

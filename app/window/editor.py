@@ -158,8 +158,7 @@ def make_application(settings: Settings) -> QApplication:
     from PySide6.QtWidgets import QApplication
 
     from app.view.theme import apply_theme, wanted_theme
-    from app.window.garbage_collection import GarbageCollector
-    from app.window.process_memory import keep_memory_small
+    from app.window.memory import GarbageCollector, keep_memory_small
 
     keep_memory_small()
     QSurfaceFormat.setDefaultFormat(_surface_format())

@@ -14,6 +14,7 @@ from PySide6.QtWidgets import QApplication, QDialog, QWidget
 from app.editing.settings import Settings
 from app.view.theme import program_icon
 from app.view.viewport import Viewport
+from app.window.bars import StatusBar, make_bar
 from app.window.body_menus import BodyMenus
 from app.window.command import Commands, EditorWindow
 from app.window.commands.edit import EDIT
@@ -25,21 +26,16 @@ from app.window.commands.pose import POSE, set_up_drags
 from app.window.commands.view import VIEW, remembered_shading, set_up_ghost
 from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.questions import wait_for_exports
+from app.window.event_filters import FileDrops, PaintGate, WindowShortcuts
 from app.window.file_actions import FileActions
 from app.window.hidden_meshes import HiddenMeshes
-from app.window.layout import Layout
+from app.window.layout import Layout, Panel
 from app.window.learning_actions import LearningActions
-from app.window.paint_gate import PaintGate
 from app.window.panels.bodies import BodiesPanel
 from app.window.panels.collision import CollisionPanel
-from app.window.panels.dock import Panel
 from app.window.panels.library import LibraryPanel
 from app.window.panels.sliders import RandomiseRow, SlidersPanel
 from app.window.panels.timeline import TimelinePanel
-from app.window.shortcuts import WindowShortcuts
-from app.window.status_bar import StatusBar
-from app.window.tool_bar import make_bar
-from app.window.widgets import FileDrops
 from app.work.preparing import Preparing
 from lcollision_core.tasks.words import one_line
 

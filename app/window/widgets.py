@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable
 from functools import partial
 from html import escape
-from pathlib import Path
 from typing import TypeVar
 
 from PySide6.QtCore import (
     QEvent,
-    QObject,
     QPoint,
     QPointF,
     QRect,
@@ -19,7 +16,6 @@ from PySide6.QtCore import (
     QSignalBlocker,
     QSize,
     Qt,
-    QTimer,
     Signal,
     Slot,
 )
@@ -27,8 +23,6 @@ from PySide6.QtGui import (
     QAction,
     QColor,
     QContextMenuEvent,
-    QDragEnterEvent,
-    QDropEvent,
     QEnterEvent,
     QGuiApplication,
     QIcon,
@@ -44,8 +38,6 @@ from PySide6.QtGui import (
     QWheelEvent,
 )
 from PySide6.QtWidgets import (
-    QAbstractButton,
-    QDialog,
     QDoubleSpinBox,
     QFrame,
     QHBoxLayout,
@@ -328,34 +320,6 @@ class HoverRow(QWidget):
         if self._colour:
             area = QRectF(self._swatch_left, self.height() / 2 - 6, SWATCH, SWATCH)
             fill_area(painter, area, self._colour, 3)
-
-
-class FileDrops(QObject):
-    """Accept files dropped on a widget.
-
-    Signals
-    -------
-    dropped : list of Path, at least one; emitted once the source program no longer waits
-    """
-
-    dropped = Signal(object)
-
-    def __init__(self, widget: QWidget) -> None:
-        super().__init__(widget)
-        widget.setAcceptDrops(True)
-        widget.installEventFilter(self)
-
-    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
-        """Accept files."""
-        if isinstance(event, QDragEnterEvent | QDropEvent):
-            urls = event.mimeData().urls()
-            paths = [Path(url.toLocalFile()) for url in urls if url.isLocalFile()]
-            if paths:
-                event.acceptProposedAction()
-            if paths and event.type() is QEvent.Type.Drop:
-                QTimer.singleShot(0, self, lambda: self.dropped.emit(paths))
-            return True
-        return super().eventFilter(watched, event)
 
 
 class ThemedIcon(QLabel):
@@ -764,67 +728,3 @@ class NumberBox(QDoubleSpinBox):
         """Whether a text is a number, in the user's language, beyond the field's range."""
         number, is_number = self.locale().toDouble(text.removesuffix(self.suffix()).strip())
         return is_number and not self.minimum() <= number <= self.maximum()
-
-
-_MARK = re.compile("&(?!&)(.)|&&")
-
-
-class Mnemonics(QObject):
-    """Give the visible buttons and labels of a dialog unique mnemonics, updated with its layout.
-
-    A mnemonic in a text is kept unless an earlier item has it too. Other items get the first free
-    letter that begins a word, or else any free letter.
-
-    Parameters
-    ----------
-    dialog : whose buttons and labels with a buddy are marked
-    """
-
-    def __init__(self, dialog: QDialog) -> None:
-        super().__init__(dialog)
-        self._dialog = dialog
-        dialog.installEventFilter(self)
-
-    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
-        """Mark new items before they are drawn."""
-        if event.type() in (QEvent.Type.Show, QEvent.Type.LayoutRequest):
-            self._mark()
-        return super().eventFilter(watched, event)
-
-    def _mark(self) -> None:
-        labels = [label for label in self._dialog.findChildren(QLabel) if label.buddy() is not None]
-        # The text of a button that a label names is a value, such as a colour.
-        named = {label.buddy() for label in labels}
-        buttons = [button for button in self._dialog.findChildren(QAbstractButton) if button.text()]
-        items: list[QAbstractButton | QLabel] = [
-            button for button in buttons if button not in named
-        ]
-        items += labels
-        letters = set[str]()
-        new: list[QAbstractButton | QLabel] = []
-        for item in (item for item in items if item.isVisibleTo(self._dialog)):
-            letter = mnemonic(item.text())
-            if letter and letter not in letters:
-                letters.add(letter)
-            else:
-                new.append(item)
-        for item in new:
-            text = _MARK.sub(lambda found: found[1] or "&&", item.text())
-            marked = _with_mark(text, letters)
-            letters.add(mnemonic(marked))
-            if marked != item.text():
-                item.setText(marked)
-
-
-def mnemonic(text: str) -> str:
-    """Return the mnemonic of a text in lower case, "" for none."""
-    return next((mark[1].casefold() for mark in _MARK.finditer(text) if mark[1]), "")
-
-
-def _with_mark(text: str, taken: set[str]) -> str:
-    """Mark the best free letter of a text; return the text unchanged if none is free."""
-    starts = [match.start() for match in re.finditer(r"\b\w", text)]
-    for place in (*starts, *range(len(text))):
-        if text[place].isalnum() and text[place].casefold() not in taken:
-            return f"{text[:place]}&{text[place:]}"
-    return text

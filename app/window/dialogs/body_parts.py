@@ -20,7 +20,8 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import NORMAL, ROW_HEIGHT
 from app.window.dialogs.questions import free_model_name, why_no_model_name
-from app.window.widgets import Mnemonics, dialog_vbox, hbox, labelled, swatch_icon, vbox
+from app.window.event_filters import Mnemonics
+from app.window.widgets import dialog_vbox, hbox, labelled, swatch_icon, vbox
 from lcollision_core.errors import ModelFileError
 from lcollision_core.tasks.changing import PartEdits
 

@@ -23,7 +23,8 @@ from PySide6.QtWidgets import (
 from app.view.legend import with_swatch
 from app.view.shading import UNCOUNTED_FACE
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
-from app.window.widgets import Mnemonics, NumberBox, dialog_vbox, hbox, labelled, screen_of, vbox
+from app.window.event_filters import Mnemonics
+from app.window.widgets import NumberBox, dialog_vbox, hbox, labelled, screen_of, vbox
 from lcollision_core.errors import ShapeError
 from lcollision_core.tasks.words import counted, with_capital
 

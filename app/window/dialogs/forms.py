@@ -23,7 +23,8 @@ from PySide6.QtWidgets import (
 
 from app.editing.settings import SETTINGS, Settings
 from app.view.theme import NORMAL, WIDE
-from app.window.widgets import Mnemonics, NumberBox, dialog_vbox, labelled, swatch_icon
+from app.window.event_filters import Mnemonics
+from app.window.widgets import NumberBox, dialog_vbox, labelled, swatch_icon
 from lcollision_core.files.table import FILES, WRITABLE_SUFFIXES
 from lcollision_core.options import ExportRequest, PrintOptions
 from lcollision_core.tasks.words import menu_text

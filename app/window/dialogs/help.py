@@ -18,7 +18,8 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import CLOSE, NORMAL, WIDE, program_icon
 from app.window.dialogs.questions import message_box, widen
-from app.window.widgets import Mnemonics, dialog_vbox, labelled, screen_of, scrolling
+from app.window.event_filters import Mnemonics
+from app.window.widgets import dialog_vbox, labelled, screen_of, scrolling
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body

@@ -9,9 +9,9 @@ from PySide6.QtGui import QWheelEvent
 from PySide6.QtWidgets import QComboBox, QDialog, QDialogButtonBox, QGridLayout, QWidget
 
 from app.view.theme import CLOSE, NORMAL, TIGHT
+from app.window.event_filters import Mnemonics
 from app.window.widgets import (
     Card,
-    Mnemonics,
     ThemedIcon,
     dialog_vbox,
     labelled,

@@ -21,10 +21,10 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.window.dialogs.questions import ask_to_discard
+from app.window.event_filters import Mnemonics
 from app.window.widgets import (
     SWATCH,
     Card,
-    Mnemonics,
     ThemedIcon,
     dialog_vbox,
     hbox,

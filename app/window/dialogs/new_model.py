@@ -33,10 +33,9 @@ from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.view.thumbnail import thumbnail_pixmap
 from app.window.dialogs.learning import STAGE_WORDS
 from app.window.dialogs.questions import free_model_name, why_no_model_name
+from app.window.event_filters import FileDrops, Mnemonics
 from app.window.widgets import (
     Card,
-    FileDrops,
-    Mnemonics,
     NumberBox,
     dialog_vbox,
     hbox,

@@ -25,7 +25,8 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.theme import NORMAL, WIDE, current_theme, pixmap
-from app.window.widgets import Mnemonics, ThemedIcon, dialog_vbox, hbox, labelled, vbox
+from app.window.event_filters import Mnemonics
+from app.window.widgets import ThemedIcon, dialog_vbox, hbox, labelled, vbox
 from app.work.log import log_file
 from app.work.threads import Failure
 from lcollision_core.tasks.words import counted, heading, menu_text, one_line, with_capital

@@ -22,7 +22,7 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.theme import TIGHT
-from app.window.panels.dock import Docking
+from app.window.layout import Docking
 from app.window.widgets import hbox, labelled
 
 if TYPE_CHECKING:

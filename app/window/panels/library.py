@@ -40,7 +40,7 @@ from app.editing.live_pose import starter_poses, training_pose
 from app.view.camera import preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT
 from app.view.thumbnail import thumbnail_pixmap
-from app.window.panels.dock import Docking, bring_up
+from app.window.layout import Docking, bring_up
 from app.window.widgets import ElidedLabel, Slider, hbox, labelled, plain_tip, signals_blocked, vbox
 from app.work.threads import single_shot
 from lcollision_core.tasks.words import menu_text, one_line

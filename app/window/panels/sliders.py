@@ -15,7 +15,7 @@ from PySide6.QtWidgets import QLineEdit, QToolButton, QWidget
 
 from app.editing.live_pose import code_name
 from app.view.theme import CLOSE, ICON_SIZE, NORMAL, ROW_HEIGHT, TIGHT, give_icon
-from app.window.panels.dock import Docking, bring_up
+from app.window.layout import Docking, bring_up
 from app.window.widgets import (
     LEAST_TRACK,
     NAME_SHARE,

@@ -20,7 +20,7 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.theme import ICON_SIZE, NORMAL, TIGHT, give_icon
-from app.window.panels.dock import Docking, bring_up
+from app.window.layout import Docking, bring_up
 from app.window.panels.timeline_strip import BETWEEN, TimelineStrip
 from app.window.widgets import ElidedLabel, NumberBox, hbox, labelled, signals_blocked, vbox
 from lcollision_core.tasks.words import counted, duration_text, menu_text, spent_text

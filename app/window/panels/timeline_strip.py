@@ -31,7 +31,7 @@ from PySide6.QtWidgets import QSizePolicy, QToolTip, QWidget
 
 from app.view.shading import FloatArray, ramp, rgb
 from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme, mixed
-from app.window.panels.prediction import EVEN_ODDS
+from app.window.panels.collision import EVEN_ODDS
 from app.window.widgets import plain_tip
 from lcollision_core.tasks.words import counted, grouped, heading, height_text
 

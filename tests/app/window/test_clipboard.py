@@ -10,7 +10,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QMenu
 from pytestqt.qtbot import QtBot
 
-from app.window.clipboard import _KIND, paste_pose
+from app.window.commands.edit import _KIND, paste_pose
 from app.window.dialogs.questions import FailureDialog
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import LearnedBody, RigBody

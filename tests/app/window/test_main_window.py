@@ -29,9 +29,9 @@ from app.editing.document import PoseDocument
 from app.editing.live_pose import code_name, training_pose
 from app.view.shading import Shading
 from app.view.theme import Ring
+from app.window.bars import StatusBar
 from app.window.dialogs.questions import FailureDialog
 from app.window.main_window import MainWindow
-from app.window.status_bar import StatusBar
 from app.window.widgets import HANDLE
 from app.work import preparing
 from app.work.preparing import REASON

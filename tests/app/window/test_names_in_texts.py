@@ -17,7 +17,7 @@ from app.editing.live_pose import code_name
 from app.window.dialogs.help import ShortcutsDialog
 from app.window.dialogs.questions import FailureDialog, ask_about_changes, ask_for_name
 from app.window.main_window import MainWindow
-from app.window.panels.prediction import DomainRow
+from app.window.panels.collision import DomainRow
 from app.window.widgets import NATIVE
 from app.work.threads import Failure
 from lcollision_core.bodies import LearnedBody, sample_poses

@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from app.editing import live_pose
-from app.window import paint_gate
+from app.window import event_filters
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import sample_poses
 from tests.app.windows import PATIENCE, rest
@@ -31,7 +31,7 @@ def test_the_window_is_painted_only_once_all_follows_the_pose(
     qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live_pose, "_QUICK_SECONDS", math.inf)
-    monkeypatch.setattr(paint_gate, "_PATIENCE_MILLISECONDS", PATIENCE)
+    monkeypatch.setattr(event_filters, "_PATIENCE_MILLISECONDS", PATIENCE)
     document, canvas = window.document, window.viewport.canvas
     assert canvas is not None
     bars = [row.bar for row in window.collision.prediction.rows]

@@ -26,8 +26,8 @@ from app.view.legend import LegendStrip
 from app.view.shading import Shading
 from app.window.dialogs.forms import resolve_form, screenshot_form, video_form
 from app.window.dialogs.questions import FailureDialog
+from app.window.layout import beside
 from app.window.main_window import MainWindow
-from app.window.panels.dock import beside
 from app.window.widgets import screen_of
 from app.work.threads import Failure
 from lcollision_core.bodies import LearnedBody, sample_poses

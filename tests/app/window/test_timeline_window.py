@@ -20,8 +20,8 @@ from app.view.camera import View, sees_all
 from app.view.offscreen import MotionVideo, VideoStyle
 from app.view.shading import Shading
 from app.window.dialogs.forms import MotionDialog
+from app.window.layout import bring_up
 from app.window.main_window import MainWindow
-from app.window.panels.dock import bring_up
 from app.work.motion_checks import MotionChecks
 from lcollision_core.bodies import ExportRequest, open_body, read_poses
 from lcollision_core.bodies.motions import read_motions

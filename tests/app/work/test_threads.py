@@ -15,7 +15,7 @@ from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.window.garbage_collection import GarbageCollector
+from app.window.memory import GarbageCollector
 from app.work.frames import FrameEvaluator, PoseFrame
 from app.work.threads import Failure, LongWork
 from lcollision_core.bodies import LearnedBody, NamedPose, sample_poses, write_poses

@@ -30,8 +30,8 @@ from app.window.dialogs.forms import (
 from app.window.dialogs.learning import LearningDialog
 from app.window.dialogs.new_model import NewModelDialog
 from app.window.dialogs.questions import FailureDialog, NameDialog
+from app.window.event_filters import Mnemonics, mnemonic
 from app.window.main_window import MainWindow
-from app.window.widgets import Mnemonics, mnemonic
 from app.work.threads import Failure
 from lcollision_core.bodies import RigBody
 from tests.app.windows import answer, rest

@@ -18,8 +18,8 @@ from app.editing.history import Source
 from app.editing.live_pose import code_name
 from app.view.offscreen import VideoStyle
 from app.window.main_window import MainWindow
+from app.window.panels.collision import DomainRow
 from app.window.panels.library import THUMBNAIL
-from app.window.panels.prediction import DomainRow
 from app.window.panels.sliders import CodeRow
 from lcollision_core.bodies import LearnedBody, NamedPose, RigBody, write_poses
 from lcollision_core.files import read_character
