@@ -8,7 +8,7 @@ from PySide6.QtWidgets import QProgressBar, QSizePolicy, QStatusBar, QToolBar, Q
 from app.view.shading import Shading
 from app.view.theme import ICON_SIZE, NORMAL, Ring, give_icon
 from app.window.command import Commands
-from app.window.widgets import labelled
+from app.window.widgets import described, labelled
 from lcollision_core.tasks.words import one_line
 
 _MESSAGE_MILLISECONDS = 8000
@@ -28,14 +28,11 @@ class StatusBar(QStatusBar):
         super().__init__()
         self._work, self._reason, self._is_measured, self._hint = "", "", False, ""
         self.busy = labelled("")
-        self._bar = QProgressBar()
+        self._bar = QProgressBar(textVisible=False, maximum=1)
         self._bar.setFixedWidth(120)
-        self._bar.setTextVisible(False)
-        self._bar.setRange(0, 1)
         self._ring = Ring(_RING_SIDE)
-        self.cancel = QToolButton()
+        self.cancel = described(QToolButton(), "Cancel the export")
         self.cancel.setText("Cancel")
-        self.cancel.setToolTip("Cancel the export")
         self._facts = labelled("", "caption")
         for widget in (self.busy, self._ring, self._bar, self.cancel, self._facts):
             self.addPermanentWidget(widget)
@@ -131,8 +128,7 @@ def make_bar(commands: Commands) -> QToolBar:
     camera.setMenu(commands.submenus["&Camera view"])
     give_icon(camera, "camera")
     camera.setObjectName("cameras")
-    camera.setToolTip("Camera view")
-    camera.setAccessibleName("Camera view")
+    described(camera, "Camera view", "Camera view")
     bar.addWidget(camera)
     bar.addAction(actions["screenshot"])
     for button in bar.findChildren(QToolButton):

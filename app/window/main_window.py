@@ -197,14 +197,13 @@ class MainWindow(EditorWindow):
         self.bodies.clip_wanted.connect(
             lambda *wanted: self.attempt(partial(self.files.play_clip, *wanted))
         )
-        for panel in (self.sliders, self.collision):
-            panel.domain_hovered.connect(self.viewport.highlight_domain)
-        self.collision.faces_selected.connect(self.viewport.tint_faces)
-        self.collision.points_selected.connect(self.viewport.look_at)
         for rows in (self.sliders, self.collision.prediction):
+            rows.domain_hovered.connect(self.viewport.highlight_domain)
             rows.menu_wanted.connect(self._body_menus.open_on_part)
-        self.viewport.domain_hovered.connect(self.sliders.light_domain)
-        self.viewport.domain_hovered.connect(self.collision.prediction.light_domain)
+            self.viewport.domain_hovered.connect(rows.light_domain)
+        for card in (self.collision.exact, self.collision.proposal):
+            card.faces_selected.connect(self.viewport.tint_faces)
+        self.collision.exact.points_selected.connect(self.viewport.look_at)
         self.viewport.follow_menu(self.menus[POSE.title])
         self.viewport.waiting.open_wanted.connect(self.actions_by_key["open_model"].trigger)
         document.model_changed.connect(self._on_model)

@@ -38,12 +38,14 @@ from PySide6.QtGui import (
     QWheelEvent,
 )
 from PySide6.QtWidgets import (
+    QBoxLayout,
     QDoubleSpinBox,
     QFrame,
     QHBoxLayout,
     QLabel,
     QLayout,
     QMenu,
+    QPushButton,
     QScrollArea,
     QSizePolicy,
     QSlider,
@@ -70,6 +72,7 @@ signals_blocked = QSignalBlocker
 
 Margins = tuple[int, int, int, int]
 Box = TypeVar("Box", QHBoxLayout, QVBoxLayout)
+Widget = TypeVar("Widget", bound=QWidget)
 
 _NONE: Margins = (0, 0, 0, 0)
 
@@ -95,6 +98,10 @@ class Card(QFrame):
         self.setObjectName(name)
         self.column = vbox(margins=(CLOSE, NORMAL - 2, CLOSE, NORMAL - 2))
         self.setLayout(self.column)
+
+    def add(self, *items: QWidget | QLayout | None) -> None:
+        """Add widgets and layouts at the bottom; None is a stretch."""
+        _fill(self.column, items)
 
 
 class ElidedLabel(QLabel):
@@ -208,6 +215,11 @@ def _filled(
 ) -> Box:
     layout.setSpacing(spacing)
     layout.setContentsMargins(*margins)
+    _fill(layout, items)
+    return layout
+
+
+def _fill(layout: QBoxLayout, items: Iterable[QWidget | QLayout | None]) -> None:
     for item in items:
         if isinstance(item, QWidget):
             layout.addWidget(item)
@@ -215,7 +227,37 @@ def _filled(
             layout.addLayout(item)
         else:
             layout.addStretch()
-    return layout
+
+
+def held(layout: QLayout) -> QWidget:
+    """Return a widget that holds a layout, without margins."""
+    holder = QWidget()
+    layout.setContentsMargins(0, 0, 0, 0)
+    holder.setLayout(layout)
+    return holder
+
+
+def described(widget: Widget, tip: str, name: str = "") -> Widget:
+    """Set a widget's tool tip, and its name for assistive technologies; return the widget."""
+    widget.setToolTip(tip)
+    widget.setAccessibleName(name)
+    return widget
+
+
+def push_button(
+    text: str, tip: str = "", clicked: Callable[[], object] | None = None
+) -> QPushButton:
+    """Return a button that Enter presses only if it has the focus.
+
+    Parameters
+    ----------
+    tip : its tool tip
+    clicked : connected to the signal of this name
+    """
+    button = described(QPushButton(text, autoDefault=False), tip)
+    if clicked is not None:
+        button.clicked.connect(clicked)
+    return button
 
 
 def dialog_vbox(*items: QWidget | QLayout | None) -> QVBoxLayout:

@@ -9,19 +9,15 @@ from PySide6.QtGui import QColor, QKeyEvent
 from PySide6.QtWidgets import (
     QAbstractItemView,
     QColorDialog,
-    QDialog,
-    QDialogButtonBox,
     QLineEdit,
     QListWidget,
     QListWidgetItem,
-    QPushButton,
     QWidget,
 )
 
 from app.view.theme import NORMAL, ROW_HEIGHT
-from app.window.dialogs.questions import free_model_name, why_no_model_name
-from app.window.event_filters import Mnemonics
-from app.window.widgets import dialog_vbox, hbox, labelled, swatch_icon, vbox
+from app.window.dialogs.questions import Dialog, free_model_name, why_no_model_name
+from app.window.widgets import described, hbox, held, labelled, push_button, swatch_icon, vbox
 from lcollision_core.errors import ModelFileError
 from lcollision_core.tasks.changing import PartEdits
 
@@ -32,7 +28,7 @@ _DOMAIN, _COLOUR = Qt.ItemDataRole.UserRole, Qt.ItemDataRole.UserRole + 1
 _SWATCH = 16
 
 
-class BodyPartsDialog(QDialog):
+class BodyPartsDialog(Dialog):
     """Edit the names and colours of body parts, and their order in the panels.
 
     Parameters
@@ -49,13 +45,10 @@ class BodyPartsDialog(QDialog):
     edited = Signal(object)
 
     def __init__(self, model: Body, copies: bool, parent: QWidget) -> None:
-        super().__init__(parent)
-        self.setWindowTitle("Body parts")
-        Mnemonics(self)
+        super().__init__("Body parts", parent)
         self.resize(420, 480)
         self._model = model
-        self.list = QListWidget()
-        self.list.setAccessibleName("Body parts")
+        self.list = described(QListWidget(), "", "Body parts")
         self.list.setIconSize(QSize(_SWATCH, _SWATCH))
         self.list.setDragDropMode(QAbstractItemView.DragDropMode.InternalMove)
         self.list.setEditTriggers(
@@ -71,11 +64,10 @@ class BodyPartsDialog(QDialog):
             self.list.addItem(item)
             self._put_colour(item, model.card.domain_colours[domain])
         self.list.setCurrentRow(0)
-        self.rename, self.colour, self.up, self.down = sides = [
-            QPushButton(text) for text in ("Rename", "Colour…", "Move up", "Move down")
-        ]
-        for button in sides:
-            button.setAutoDefault(False)
+        self.rename = push_button("Rename", clicked=self.edit_name)
+        self.colour = push_button("Colour…", clicked=self.choose_colour)
+        self.up = push_button("Move up", clicked=lambda: self._move(-1))
+        self.down = push_button("Move down", clicked=lambda: self._move(1))
         note = (
             f"“{model.name}” is bundled with the program and can't be changed: your changes go to "
             f"a copy among your models, which opens in its place with this pose."
@@ -84,32 +76,19 @@ class BodyPartsDialog(QDialog):
         )
         if not model.is_trained:
             note = "The changes are remembered for this character; its file isn't changed."
-        self.copy_name = QLineEdit(free_model_name(model.name, 2))
-        self.copy_name.setAccessibleName("Name of the copy")
-        copy_row = QWidget()
         copy_label = labelled("Name of the copy", "caption")
+        self.copy_name = described(QLineEdit(free_model_name(model.name, 2)), "", copy_label.text())
         copy_label.setBuddy(self.copy_name)
-        copy_row.setLayout(hbox(copy_label, self.copy_name))
+        copy_row = held(hbox(copy_label, self.copy_name))
         copy_row.setVisible(copies)
         self.refusal = labelled("", "refusal", wraps=True)
         self.refusal.hide()
         self._copies = copies
-        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
-        self.save = buttons.addButton(
-            "Save as a copy" if copies else "Save", QDialogButtonBox.ButtonRole.AcceptRole
-        )
-        middle = hbox(self.list, vbox(*sides, None), wide=self.list, spacing=NORMAL)
+        sides = vbox(self.rename, self.colour, self.up, self.down, None)
+        middle = hbox(self.list, sides, wide=self.list, spacing=NORMAL)
         explained = labelled(note, "caption", wraps=True)
-        page = dialog_vbox(middle, explained, copy_row, self.refusal, buttons)
-        page.setStretchFactor(middle, 1)
-        self.setLayout(page)
-        self.save.setDefault(True)
-        buttons.accepted.connect(self.accept)
-        buttons.rejected.connect(self.reject)
-        self.rename.clicked.connect(self.edit_name)
-        self.colour.clicked.connect(self.choose_colour)
-        self.up.clicked.connect(lambda: self._move(-1))
-        self.down.clicked.connect(lambda: self._move(1))
+        action = "Save as a copy" if copies else "Save"
+        self.save = self.lay_out(middle, explained, copy_row, self.refusal, accept=action, grows=0)
         self.list.currentRowChanged.connect(self._on_row)
         self.list.model().rowsMoved.connect(lambda: self._on_row(self.list.currentRow()))
         self._on_row(0)

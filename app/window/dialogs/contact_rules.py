@@ -10,10 +10,8 @@ from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import (
     QCheckBox,
     QComboBox,
-    QDialog,
     QDialogButtonBox,
     QLabel,
-    QPushButton,
     QTreeWidget,
     QTreeWidgetItem,
     QVBoxLayout,
@@ -23,8 +21,18 @@ from PySide6.QtWidgets import (
 from app.view.legend import with_swatch
 from app.view.shading import UNCOUNTED_FACE
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
-from app.window.event_filters import Mnemonics
-from app.window.widgets import NumberBox, dialog_vbox, hbox, labelled, screen_of, vbox
+from app.window.dialogs.questions import Dialog
+from app.window.widgets import (
+    NumberBox,
+    described,
+    dialog_vbox,
+    hbox,
+    held,
+    labelled,
+    push_button,
+    screen_of,
+    vbox,
+)
 from lcollision_core.errors import ShapeError
 from lcollision_core.tasks.words import counted, with_capital
 
@@ -60,7 +68,7 @@ _TINT = "Crosses in the pose shown, but isn't counted"
 _CHECKED, _UNCHECKED = Qt.CheckState.Checked, Qt.CheckState.Unchecked
 
 
-class ContactsDialog(QDialog):
+class ContactsDialog(Dialog):
     """The contact rules of the open body, each with its count of pairs at rest.
 
     Parameters
@@ -90,9 +98,7 @@ class ContactsDialog(QDialog):
     faces_selected = Signal(object)
 
     def __init__(self, document: PoseDocument, parent: QWidget) -> None:
-        super().__init__(parent)
-        self.setWindowTitle("Contacts")
-        Mnemonics(self)
+        super().__init__("Contacts", parent)
         self.setMinimumWidth(_WIDTH)
         self._document = document
         self._notes: list[QLabel] = []
@@ -190,39 +196,32 @@ class ContactsDialog(QDialog):
 
     def _ignored_part(self) -> QWidget:
         """Return the tree of ignored pairs with the widgets that add to it."""
-        self.ignored = QTreeWidget()
+        self.ignored = described(QTreeWidget(), "", "Ignored pairs")
+        self.ignored.setHeaderHidden(True)
+        self.ignored.setUniformRowHeights(True)
+        self.ignored.setIndentation(NORMAL + TIGHT)
         self._pairs: dict[tuple[str, str], QTreeWidgetItem] = {}
         self._kinds: dict[str, QTreeWidgetItem] = {}
         self._left_out: dict[str, QTreeWidgetItem] = {}
         self._tolerated: dict[tuple[str, str, float], QTreeWidgetItem] = {}
-        self.ignored.setHeaderHidden(True)
-        self.ignored.setUniformRowHeights(True)
-        self.ignored.setIndentation(NORMAL + TIGHT)
-        self.ignored.setAccessibleName("Ignored pairs")
         self.ignored.setMinimumHeight(_LIST_HEIGHT)
-        self.first, self.second = QComboBox(), QComboBox()
-        for box, name in ((self.first, "First group"), (self.second, "Second group")):
-            box.setAccessibleName(name)
-            box.setMinimumContentsLength(8)
-            box.setToolTip("Meshes, materials and body parts of the file")
-        self.add, self.propose = QPushButton("Ignore"), QPushButton("Propose")
-        self.add.setToolTip("Don't count any contact between these two")
-        self.propose.setToolTip(
-            "List the groups that touch in nearly every pose: tick pairs, or a whole kind"
+        tip = "Meshes, materials and body parts of the file"
+        self.first, self.second = (
+            described(QComboBox(minimumContentsLength=8), tip, name)
+            for name in ("First group", "Second group")
         )
-        self.own_depth, self.tolerate = self._field("tolerated"), QPushButton("Set")
+        tip = "Don't count any contact between these two"
+        self.add = push_button("Ignore", tip, self._add_pair)
+        tip = "List the groups that touch in nearly every pose: tick pairs, or a whole kind"
+        self.propose = push_button("Propose", tip, self._document.tasks.propose_pairs)
+        self.own_depth = self._field("tolerated")
         self.own_depth.setValue(_DEFAULT_DEPTH)
-        self.tolerate.setToolTip("Count contact between these two only beyond this depth")
-        self.tolerate.clicked.connect(self._add_tolerated)
-        for button in (self.add, self.propose, self.tolerate):
-            button.setAutoDefault(False)
+        tip = "Count contact between these two only beyond this depth"
+        self.tolerate = push_button("Set", tip, self._add_tolerated)
         for box in (self.first, self.second):
             box.textActivated.connect(self._name_choice)
         self.ignored.currentItemChanged.connect(self._name_item)
-        self.add.clicked.connect(self._add_pair)
-        self.propose.clicked.connect(self._document.tasks.propose_pairs)
         self.ignored.itemChanged.connect(self._on_edited)
-        row = QWidget()
         called = labelled("Ignored pairs and parts", "title")
         title = hbox(called, None, self.counts["ignored"], self.propose)
         choice = hbox(self.first, labelled("and", "caption"), self.second, self.add)
@@ -230,14 +229,12 @@ class ContactsDialog(QDialog):
             choice.setStretchFactor(box, 1)
         beyond = labelled("or count only deeper than", "caption")
         deeper = hbox(beyond, None, self.own_depth, self.tolerate)
-        row.setLayout(vbox(title, self.ignored, choice, deeper, spacing=CLOSE))
-        return row
+        return held(vbox(title, self.ignored, choice, deeper, spacing=CLOSE))
 
     def _field(self, name: str) -> NumberBox:
-        field = NumberBox(2, 0.0, _MOST[name])
+        field = described(NumberBox(2, 0.0, _MOST[name]), "In per cent of the body size")
         field.setSuffix(" %")
         field.setSingleStep(0.5)
-        field.setToolTip("In per cent of the body size")
         field.setFixedWidth(96)
         return field
 
@@ -345,8 +342,7 @@ class ContactsDialog(QDialog):
         model = self._document.model
         self._write(self.folds, _FOLDS + ", less at thin limbs" * self._near_by_limb())
         can_change = not model.has_predictor
-        always: tuple[QWidget, ...] = (self.near, self.at_rest, self.tolerated, self.ignored)
-        for widget in always:
+        for widget in (self.near, self.at_rest, self.tolerated, self.ignored, self.propose):
             widget.setEnabled(can_change)
         self.rest.setEnabled(can_change and self.at_rest.isChecked())
         self.at_joints.setEnabled(can_change and model.has_joints)
@@ -367,7 +363,6 @@ class ContactsDialog(QDialog):
         for choice in (self.first, self.second, self.add, self.own_depth, self.tolerate):
             choice.setEnabled(several)
         free = can_change and not self._document.tasks.changing_model
-        self.propose.setEnabled(can_change)
         self.restore.setEnabled(free and model.rules_are_chosen)
         self.apply.setEnabled(free and self._differ())
 
@@ -406,11 +401,8 @@ class ContactsDialog(QDialog):
         for known in [known for known in self._tolerated if {*known[:2]} == {*one[:2]}]:
             self.ignored.invisibleRootItem().removeChild(self._tolerated.pop(known))
         text = f"{pair_in_words(one[:2])}: up to {_PERCENT * one[2]:g} %"
-        item = self._tolerated[one] = QTreeWidgetItem(self.ignored, [text])
-        item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
-        item.setCheckState(0, _CHECKED)
-        item.setSizeHint(0, _ROW)
-        item.setToolTip(0, "Ticked: contact between these two counts only beyond this depth")
+        tip = "Ticked: contact between these two counts only beyond this depth"
+        item = self._tolerated[one] = _ticked_item(self.ignored, text, _CHECKED, tip)
         return item
 
     @Slot(object)
@@ -467,12 +459,8 @@ class ContactsDialog(QDialog):
             if known in self._pairs:
                 return self._pairs[known]
         kind = self._kind(pair)
-        # An item made with its parent takes part in the parent's tristate tick.
-        item = self._pairs[pair] = QTreeWidgetItem(kind, [pair_in_words(pair)])
-        item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
-        item.setCheckState(0, state)
-        item.setSizeHint(0, _ROW)
-        item.setToolTip(0, "Ticked: contacts between these two are not counted")
+        tip = "Ticked: contacts between these two are not counted"
+        item = self._pairs[pair] = _ticked_item(kind, pair_in_words(pair), state, tip)
         return item
 
     def _list_parts(self, rules: ContactRules) -> None:
@@ -505,10 +493,8 @@ class ContactsDialog(QDialog):
         parts.setToolTip(0, "Ticked: left out of the check; still posed and exported")
         parts.setSizeHint(0, _ROW)
         for name in names:
-            item = self._left_out[name] = QTreeWidgetItem(parts, [name])
-            item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
-            item.setCheckState(0, _CHECKED if name in rules.left_out else _UNCHECKED)
-            item.setSizeHint(0, _ROW)
+            state = _CHECKED if name in rules.left_out else _UNCHECKED
+            self._left_out[name] = _ticked_item(parts, name, state)
         parts.setExpanded(any(name in rules.left_out for name in names))
 
     def _kind(self, pair: tuple[str, str]) -> QTreeWidgetItem:
@@ -533,6 +519,19 @@ class ContactsDialog(QDialog):
         for name, kind in self._kinds.items():
             kind.setText(0, f"{with_capital(name)} ({kind.childCount()})")
             kind.setExpanded(len(self._kinds) == 1)
+
+
+def _ticked_item(
+    parent: QTreeWidget | QTreeWidgetItem, text: str, state: Qt.CheckState, tip: str = ""
+) -> QTreeWidgetItem:
+    """Return an item of a tree that the user ticks."""
+    # An item made with its parent takes part in the parent's tristate tick.
+    item = QTreeWidgetItem(parent, [text])
+    item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
+    item.setCheckState(0, state)
+    item.setSizeHint(0, _ROW)
+    item.setToolTip(0, tip)
+    return item
 
 
 def _length(field: NumberBox, held: float | None) -> float:

@@ -13,7 +13,6 @@ from PySide6.QtWidgets import (
     QColorDialog,
     QComboBox,
     QDialog,
-    QDialogButtonBox,
     QFileDialog,
     QFormLayout,
     QLabel,
@@ -23,8 +22,8 @@ from PySide6.QtWidgets import (
 
 from app.editing.settings import SETTINGS, Settings
 from app.view.theme import NORMAL, WIDE
-from app.window.event_filters import Mnemonics
-from app.window.widgets import NumberBox, dialog_vbox, labelled, swatch_icon
+from app.window.dialogs.questions import Dialog
+from app.window.widgets import NumberBox, labelled, push_button, swatch_icon
 from lcollision_core.files.table import FILES, WRITABLE_SUFFIXES
 from lcollision_core.options import ExportRequest, PrintOptions
 from lcollision_core.tasks.words import menu_text
@@ -66,7 +65,7 @@ class ColourButton(QPushButton):
         self.setText(colour.name())
 
 
-class Form(QDialog):
+class Form(Dialog):
     """A dialog of fields that show settings and write them back when accepted.
 
     Parameters
@@ -78,24 +77,16 @@ class Form(QDialog):
     """
 
     def __init__(self, title: str, action: str, settings: Settings, parent: QWidget) -> None:
-        super().__init__(parent)
-        self.setWindowTitle(title)
-        Mnemonics(self)
+        super().__init__(title, parent)
         self.setFixedWidth(_WIDTH)
         self._settings = settings
         self._refused = False
         self._fields: dict[str, QWidget] = {}
         self._readers: dict[str, Callable[[], Any]] = {}
         self._form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=NORMAL)
-        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
-        accept = buttons.addButton(action, QDialogButtonBox.ButtonRole.AcceptRole)
         self._refusal = labelled("", "refusal", wraps=True)
         self._refusal.hide()
-        self.setLayout(dialog_vbox(self._form, self._refusal, buttons))
-        buttons.accepted.connect(self.accept)
-        buttons.rejected.connect(self.reject)
-        # Set only once the button is in the dialog: otherwise Enter would cancel.
-        accept.setDefault(True)
+        self.lay_out(self._form, self._refusal, accept=action)
 
     def accept(self) -> None:
         """Store the fields and close, unless a value has just been refused."""
@@ -375,12 +366,8 @@ class ExportDialog(_FrameForm):
         self.like = self._own if model.character is None else None
         self._forms: dict[str, ExportForm] = {}
         if self._character is None:
-            self.source = QPushButton()
-            self.source.setAutoDefault(False)
-            self.source.setToolTip(
-                "Your OBJ or GLB file of this body, whose UVs and groups are kept"
-            )
-            self.source.clicked.connect(self._ask_for_source)
+            tip = "Your OBJ or GLB file of this body, whose UVs and groups are kept"
+            self.source = push_button("", tip, self._ask_for_source)
             self.add_widget("Write into a copy of", self.source)
         self.form = self.add_choice("export_form", "Format", {MESH: "Mesh"}, "What is written")
         self._readers["export_form"] = self._remembered_form

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import (
-    QDialog,
     QDialogButtonBox,
     QFormLayout,
     QLabel,
@@ -17,8 +16,7 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.theme import CLOSE, NORMAL, WIDE, program_icon
-from app.window.dialogs.questions import message_box, widen
-from app.window.event_filters import Mnemonics
+from app.window.dialogs.questions import Dialog, message_box, widen
 from app.window.widgets import dialog_vbox, labelled, screen_of, scrolling
 
 if TYPE_CHECKING:
@@ -105,7 +103,7 @@ def show_shortcuts(menus: Iterable[tuple[str, Sequence[Shortcut]]], parent: QWid
     dialog.open()
 
 
-class ShortcutsDialog(QDialog):
+class ShortcutsDialog(Dialog):
     """List the effects of mouse and keys, then the shortcuts of commands, nested as in the menus.
 
     Parameters
@@ -118,9 +116,7 @@ class ShortcutsDialog(QDialog):
         menus: Iterable[tuple[str, Sequence[Shortcut]]],
         parent: QWidget | None = None,
     ) -> None:
-        super().__init__(parent)
-        self.setWindowTitle("Keyboard and mouse")
-        Mnemonics(self)
+        super().__init__("Keyboard and mouse", parent)
         self.resize(560, min(620, screen_of(parent or self).height() - _TITLE_BAR))
         page = QWidget()
         form = QFormLayout(page, horizontalSpacing=WIDE * 2, verticalSpacing=CLOSE - 2)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Qt, Signal, Slot
+from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QWheelEvent
-from PySide6.QtWidgets import QComboBox, QDialog, QDialogButtonBox, QGridLayout, QWidget
+from PySide6.QtWidgets import QComboBox, QGridLayout, QWidget
 
 from app.view.theme import CLOSE, NORMAL, TIGHT
-from app.window.event_filters import Mnemonics
+from app.window.dialogs.questions import Dialog
 from app.window.widgets import (
     Card,
     ThemedIcon,
-    dialog_vbox,
+    described,
     labelled,
     scrolling,
     vbox,
@@ -31,7 +31,7 @@ _COLUMNS = (_SIGN, 0), (180, 1), (_SIGN, 0), (110, 0), (170, 0)
 _NOTHING = "— nothing —"
 
 
-class JointsDialog(QDialog):
+class JointsDialog(Dialog):
     """List the joints of the body, each with a choice of the motion's joint that it follows.
 
     Parameters
@@ -53,9 +53,7 @@ class JointsDialog(QDialog):
     chosen = Signal(object)
 
     def __init__(self, match: JointMatch, motion: str, body: str, parent: QWidget) -> None:
-        super().__init__(parent)
-        self.setWindowTitle("Joints of the motion")
-        Mnemonics(self)
+        super().__init__("Joints of the motion", parent)
         self.resize(680, 680)
         self._match = match
         self.choices: dict[str, QComboBox] = {}
@@ -77,18 +75,11 @@ class JointsDialog(QDialog):
             about += " The joints at the top could not be matched by name and position."
         page = QWidget()
         page.setLayout(vbox(*cards, None, spacing=NORMAL, margins=(0, 0, CLOSE, 0)))
-        area = scrolling(page)
-        note = "Remembered for all motions of this skeleton on this body."
-        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
-        self.use = buttons.addButton("Use these", QDialogButtonBox.ButtonRole.AcceptRole)
-        column = dialog_vbox(
-            labelled(about, wraps=True), area, labelled(note, "caption", wraps=True), buttons
+        note = labelled(
+            "Remembered for all motions of this skeleton on this body.", "caption", wraps=True
         )
-        column.setStretchFactor(area, 1)
-        self.setLayout(column)
-        self.use.setDefault(True)
-        buttons.accepted.connect(self._accept)
-        buttons.rejected.connect(self.reject)
+        about_label = labelled(about, wraps=True)
+        self.use = self.lay_out(about_label, scrolling(page), note, accept="Use these", grows=1)
 
     def _card(self, title: str, rows: list[tuple[str, str]], motion: str, body: str) -> Card:
         card, grid = Card(), QGridLayout()
@@ -100,12 +91,10 @@ class JointsDialog(QDialog):
         grid.addWidget(labelled(body, "caption"), 0, 3, 1, 2)
         for row, (joint, words) in enumerate(rows, 1):
             choice = _Choice(self._match.source_joints, self._match.followed[joint])
-            choice.setAccessibleName(f"Joint of the motion for {words or joint}")
-            self.choices[joint] = choice
+            self.choices[joint] = described(choice, "", f"Joint of the motion for {words or joint}")
             if joint in self._match.unsure:
-                sign = ThemedIcon(_SIGN)
+                sign = described(ThemedIcon(_SIGN), "Not recognised by name and position")
                 sign.show_icon("question", "colliding")
-                sign.setToolTip("Not recognised by name and position")
                 grid.addWidget(sign, row, 0)
             grid.addWidget(choice, row, 1)
             grid.addWidget(labelled("→", "caption"), row, 2)
@@ -114,14 +103,13 @@ class JointsDialog(QDialog):
         for column, (width, stretch) in enumerate(_COLUMNS):
             grid.setColumnMinimumWidth(column, width)
             grid.setColumnStretch(column, stretch)
-        card.column.addWidget(labelled(title, "title"))
-        card.column.addLayout(grid)
+        card.add(labelled(title, "title"), grid)
         return card
 
-    @Slot()
-    def _accept(self) -> None:
+    def accept(self) -> None:
+        """Close, and emit the chosen joints."""
         partner_of_joint = {joint: choice.currentData() for joint, choice in self.choices.items()}
-        self.accept()
+        super().accept()
         self.chosen.emit({**self._match.followed, **partner_of_joint})
 
 

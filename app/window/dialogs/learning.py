@@ -11,7 +11,6 @@ from PySide6.QtCore import QSize, Qt, Signal, Slot
 from PySide6.QtGui import QImage, QPixmap
 from PySide6.QtWidgets import (
     QComboBox,
-    QDialog,
     QGridLayout,
     QLabel,
     QProgressBar,
@@ -20,15 +19,16 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
-from app.window.dialogs.questions import ask_to_discard
-from app.window.event_filters import Mnemonics
+from app.window.dialogs.questions import Dialog, ask_to_discard
 from app.window.widgets import (
     SWATCH,
     Card,
     ThemedIcon,
+    described,
     dialog_vbox,
     hbox,
     labelled,
+    push_button,
     restyle,
     screen_of,
     swatch_icon,
@@ -69,7 +69,7 @@ _GOES_ON = (
 )
 
 
-class LearningDialog(QDialog):
+class LearningDialog(Dialog):
     """Show one of the runs, with buttons to control it.
 
     Signals
@@ -101,23 +101,18 @@ class LearningDialog(QDialog):
         parent: QWidget,
         attempt: Callable[[Callable[[], object]], object],
     ) -> None:
-        super().__init__(parent)
-        self.setWindowTitle("Learning")
-        Mnemonics(self)
+        super().__init__("Learning", parent)
         self._runs, self._work, self._attempt = runs, work, attempt
         self.path: Path | None = None
         self._shown: tuple[Path, RunState, bool] | None = None
         self._card_of: Path | None = None
         self._read_for: Path | None = None
         self._reading = 0
-        self.which = QComboBox()
-        self.which.setAccessibleName("Model being learned")
+        self.which = described(QComboBox(), "", "Model being learned")
         self._sign = ThemedIcon(_SIGN)
         self.headline = labelled("", "headline", wraps=True)
         self.state = labelled("", wraps=True)
-        self.bar = QProgressBar()
-        self.bar.setTextVisible(False)
-        self.bar.setRange(0, 1000)
+        self.bar = QProgressBar(textVisible=False, maximum=1000)
         self._stages = _StageRows()
         self._note = labelled(_GOES_ON, "caption", wraps=True)
         self.card = LearnedCardView()
@@ -139,28 +134,24 @@ class LearningDialog(QDialog):
         super().done(result)
 
     def _lay_out(self) -> None:
-        self.stop, self.resume = QPushButton("Stop"), QPushButton("Continue")
-        self.discard = QPushButton("Discard…")
-        self.open_model, self.dismiss = QPushButton("Open"), QPushButton("Dismiss")
-        self.dismiss.setToolTip("Keep the model for later: it is under File > Models")
-        close = self._close = QPushButton("Close")
+        self.stop = push_button("Stop", clicked=partial(self._do, self._runs.stop))
+        self.resume = push_button("Continue", clicked=partial(self._do, self._runs.resume))
+        self.discard = push_button("Discard…", clicked=self._discard)
+        self.open_model = QPushButton("Open")
+        self.open_model.clicked.connect(lambda: self.open_wanted.emit(self._require_path()))
+        tip = "Keep the model for later: it is under File > Models"
+        self.dismiss = push_button("Dismiss", tip, self._dismiss)
+        self._close = push_button("Close", clicked=self.reject)
         for button in (self.resume, self.open_model):
             # Qt's size hint is too small for the bold text.
             button.setMinimumWidth(_BOLD_WIDTH)
-        for button in (self.stop, self.resume, self.discard, self.dismiss, close):
-            button.setAutoDefault(False)
-        self.stop.clicked.connect(partial(self._do, self._runs.stop))
-        self.resume.clicked.connect(partial(self._do, self._runs.resume))
-        self.discard.clicked.connect(self._discard)
-        self.open_model.clicked.connect(lambda: self.open_wanted.emit(self._require_path()))
-        self.dismiss.clicked.connect(self._dismiss)
-        close.clicked.connect(self.reject)
         words = vbox(self.headline, self.state, spacing=TIGHT)
         head = hbox(self._sign, words, spacing=NORMAL)
         head.setAlignment(self._sign, Qt.AlignmentFlag.AlignTop)
         head.setStretchFactor(words, 1)
         buttons = hbox(
-            self.discard, None, self.stop, self.resume, self.dismiss, close, self.open_model
+            *(self.discard, None, self.stop, self.resume),
+            *(self.dismiss, self._close, self.open_model),
         )
         self._column = dialog_vbox(
             self.which, head, self.bar, self._stages, self.card, self._note, buttons
@@ -218,20 +209,17 @@ class LearningDialog(QDialog):
         self._stages.follow(run)
         collides = has_ended and run.status.mostly_collides
         can_open = is_done or (collides and bool(run.status.model))
-        for widget, visible in (
-            *(
-                (self.bar, not is_done),
-                (self._stages, not is_done),
-                (self.card, is_done and self._card_of == run.path),
-            ),
-            *((self.stop, state in (RunState.RUNNING, RunState.WAITING)), (self.resume, has_ended)),
-            *((self.open_model, can_open), (self.dismiss, is_done)),
-            *(
-                (self.discard, not is_done),
-                (self._note, run.is_active and state != RunState.WAITING),
-            ),
-        ):
-            widget.setVisible(visible)
+        shown: dict[QWidget, bool] = {
+            **dict.fromkeys((self.bar, self._stages, self.discard), not is_done),
+            self.card: is_done and self._card_of == run.path,
+            self.stop: state in (RunState.RUNNING, RunState.WAITING),
+            self.resume: has_ended,
+            self.open_model: can_open,
+            self.dismiss: is_done,
+            self._note: run.is_active and state != RunState.WAITING,
+        }
+        for widget, is_shown in shown.items():
+            widget.setVisible(is_shown)
         self.discard.setEnabled(state != RunState.STOPPING)
         if is_done and run.path not in (self._card_of, self._read_for):
             self._work.cancel(self._reading)
@@ -323,13 +311,10 @@ class _StageRows(Card):
         super().__init__()
         self._rows: dict[str, tuple[ThemedIcon, QLabel, QLabel]] = {}
         for stage, words in STAGE_WORDS.items():
-            sign, name, spent = (
-                ThemedIcon(_STAGE_SIGN),
-                labelled(with_capital(words)),
-                labelled("", "caption"),
-            )
+            sign, name = ThemedIcon(_STAGE_SIGN), labelled(with_capital(words))
+            spent = labelled("", "caption")
             self._rows[stage] = sign, name, spent
-            self.column.addLayout(hbox(sign, name, None, spent))
+            self.add(hbox(sign, name, None, spent))
 
     def follow(self, run: LearningRun) -> None:
         """Show the progress of a run."""
@@ -355,12 +340,11 @@ class LearnedCardView(QWidget):
     def __init__(self) -> None:
         super().__init__()
         self.facts, self._parts = _grid(WIDE, TIGHT + 2), _grid(NORMAL, 2)
-        self.picture = QLabel()
+        name = "The body parts that were found, from the front and back"
+        self.picture = described(QLabel(), "", name)
         self.picture.setFixedSize(_PICTURE)
-        self.picture.setAccessibleName("The body parts that were found, from the front and back")
         card = Card()
-        card.column.addLayout(self.facts)
-        card.column.addStretch()
+        card.add(self.facts, None)
         column = vbox(self.picture, self._parts, spacing=CLOSE)
         self.setLayout(hbox(card, column, wide=card, spacing=WIDE))
 

@@ -15,14 +15,12 @@ from PySide6.QtWidgets import (
     QButtonGroup,
     QCheckBox,
     QComboBox,
-    QDialog,
     QFileDialog,
     QFormLayout,
     QLabel,
     QLineEdit,
     QListWidget,
     QListWidgetItem,
-    QPushButton,
     QRadioButton,
     QStackedWidget,
     QWidget,
@@ -32,15 +30,18 @@ from app.view.camera import preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.view.thumbnail import thumbnail_pixmap
 from app.window.dialogs.learning import STAGE_WORDS
-from app.window.dialogs.questions import free_model_name, why_no_model_name
-from app.window.event_filters import FileDrops, Mnemonics
+from app.window.dialogs.questions import Dialog, free_model_name, why_no_model_name
+from app.window.event_filters import FileDrops
 from app.window.widgets import (
     Card,
     NumberBox,
+    described,
     dialog_vbox,
     hbox,
+    held,
     labelled,
     plain_tip,
+    push_button,
     restyle,
     screen_of,
     scrolling,
@@ -105,10 +106,7 @@ class Page(QWidget):
     def _card(self, title: str, *rows: QWidget) -> Card:
         """Add a card with a title and some rows."""
         card = Card()
-        if title:
-            card.column.addWidget(labelled(title, "title"))
-        for row in rows:
-            card.column.addWidget(row)
+        card.add(labelled(title, "title"), *rows)
         self.column.addWidget(card)
         return card
 
@@ -136,14 +134,10 @@ class FilesPage(Page):
             "meshes, a PC2 or MDD cache beside its mesh, or an .npz pose set. Drop files here, or "
             "add them. Several files of the same body are used together.",
         )
-        self.list = QListWidget()
-        self.list.setAccessibleName("Files to learn from")
+        self.list = described(QListWidget(), "", "Files to learn from")
         self.list.setMinimumHeight(96)
-        self.add_files, self.add_folder = QPushButton("Add files…"), QPushButton("Add folder…")
-        self.remove = QPushButton("Remove")
-        for button in (self.add_files, self.add_folder, self.remove):
-            button.setAutoDefault(False)
-        self.remove.clicked.connect(self._remove)
+        self.add_files, self.add_folder = push_button("Add files…"), push_button("Add folder…")
+        self.remove = push_button("Remove", clicked=self._remove)
         delete = QShortcut(QKeySequence.StandardKey.Delete, self.list)
         delete.setContext(Qt.ShortcutContext.WidgetShortcut)
         delete.activated.connect(self._remove)
@@ -225,29 +219,28 @@ class PosesPage(Page):
             "from them alone.",
         )
         self._summary: SourcesSummary | None = None
-        self.clip, self.rate = QComboBox(), NumberBox(3, 0, 240, strip_zeros=True)
-        self.clip.setAccessibleName("Animation")
-        self.clip.setMinimumContentsLength(12)
+        self.clip = described(QComboBox(minimumContentsLength=12), "", "Animation")
+        self.rate = described(
+            NumberBox(3, 0, 240, strip_zeros=True), "How many frames per second become poses"
+        )
         self.rate.setSpecialValueText("as in the file")
-        self.rate.setToolTip("How many frames per second become poses")
         self._from_clips = labelled("", "caption", wraps=True)
-        form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=CLOSE)
-        form.addRow("Animation", self.clip)
-        form.addRow("Frames per second", self.rate)
-        self._clips = self._card("Animations", _held(form), self._from_clips)
-        self.by_rig, self.number = QComboBox(), NumberBox(0, 1, _MOST_BY_RIG)
+        form = _form(("Animation", self.clip), ("Frames per second", self.rate))
+        self._clips = self._card("Animations", form, self._from_clips)
+        self.by_rig = described(QComboBox(), "", "Poses made by the rig")
+        self.number = described(
+            NumberBox(0, 1, _MOST_BY_RIG), "", "Number of poses made by the rig"
+        )
         for key, text in (
             (_BY_QUALITY, "As many as the quality needs"),
             (_NO_POSES, "None, only those in the files"),
             (_OWN_NUMBER, "This many:"),
         ):
             self.by_rig.addItem(text, key)
-        self.by_rig.setAccessibleName("Poses made by the rig")
-        self.number.setAccessibleName("Number of poses made by the rig")
         self.number.setValue(100)
         self._rig = self._card(
             "Poses made by the rig",
-            _held(hbox(self.by_rig, self.number, None)),
+            held(hbox(self.by_rig, self.number, None)),
             labelled(
                 "The rig bends its joints within human limits, left and right alike, and prefers "
                 "poses in which the body doesn't cross itself.",
@@ -255,16 +248,13 @@ class PosesPage(Page):
                 wraps=True,
             ),
         )
-        self.up, self.scale = QComboBox(), NumberBox(6, 1e-6, 1e6)
-        self.up.setAccessibleName("Up axis")
+        self.up = described(QComboBox(), "", "Up axis")
+        self.scale = described(NumberBox(6, 1e-6, 1e6), "Model units per file unit")
         self.scale.setValue(1.0)
         self.scale.setStepType(NumberBox.StepType.AdaptiveDecimalStepType)
-        self.scale.setToolTip("Model units per file unit")
         self._size = labelled("", "caption", wraps=True)
-        form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=CLOSE)
-        form.addRow("Up", self.up)
-        form.addRow("Scale by", self.scale)
-        self._card("Axis and unit", _held(form), self._size)
+        form = _form(("Up", self.up), ("Scale by", self.scale))
+        self._card("Axis and unit", form, self._size)
         self.column.addStretch()
         for box in (self.clip, self.by_rig):
             box.currentIndexChanged.connect(self._on_edited)
@@ -392,7 +382,7 @@ class ContactsPage(Page):
             "Pieces that always touch",
             "Hair on a head, a shoe on a foot: pairs of pieces in contact in nearly every pose.",
         )
-        self._groups.column.addWidget(self.count_groups)
+        self._groups.add(self.count_groups)
         for rule in (self._rest, self._near, self._groups, self._tolerated):
             self.column.addWidget(rule)
         self.experts = QCheckBox("Choose the limits myself")
@@ -460,15 +450,13 @@ class QualityPage(Page):
             rows.addWidget(button)
             rows.addWidget(meaning)
         self.choices[Quality.GOOD].setChecked(True)
-        self._card("Quality", _held(rows))
-        self.name, self.licence = QLineEdit(), QLineEdit()
-        self.name.setMaxLength(60)
-        self.licence.setPlaceholderText("unknown")
-        self.licence.setToolTip("The licence of the character, stored in the model")
-        form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=CLOSE)
-        form.addRow("Name", self.name)
-        form.addRow("Licence", self.licence)
-        self._card("Model", _held(form))
+        self._card("Quality", held(rows))
+        self.name = QLineEdit(maxLength=60)
+        self.licence = described(
+            QLineEdit(placeholderText="unknown"),
+            "The licence of the character, stored in the model",
+        )
+        self._card("Model", _form(("Name", self.name), ("Licence", self.licence)))
         self.column.addStretch()
         self.name.textEdited.connect(lambda _: self.changed.emit())
         self._group.buttonClicked.connect(lambda _: self.changed.emit())
@@ -527,8 +515,7 @@ class _ExplainedCard(Card):
 
     def __init__(self, title: str, about: str) -> None:
         super().__init__()
-        self.column.addWidget(labelled(title, "title"))
-        self.column.addWidget(labelled(about, "caption", wraps=True))
+        self.add(labelled(title, "title"), labelled(about, "caption", wraps=True))
 
 
 class _Rule(_ExplainedCard):
@@ -545,20 +532,20 @@ class _Rule(_ExplainedCard):
         self.field.setAccessibleName(title)
         self.field.setEnabled(False)
         self.own.toggled.connect(self.field.setEnabled)
-        self.choice = _held(hbox(self.own, self.field, None))
-        self.column.addWidget(self.choice)
+        self.choice = held(hbox(self.own, self.field, None))
+        self.add(self.choice)
 
     def value(self) -> float | None:
         """Return the normalised length, None if its box is not ticked."""
         return self.field.value() / _PERCENT if self.own.isChecked() else None
 
 
-def _held(layout: Any) -> QWidget:
-    """Return a widget that holds a layout, without margins."""
-    holder = QWidget()
-    layout.setContentsMargins(0, 0, 0, 0)
-    holder.setLayout(layout)
-    return holder
+def _form(*rows: tuple[str, QWidget]) -> QWidget:
+    """Return a widget of labelled fields."""
+    form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=CLOSE)
+    for label, field in rows:
+        form.addRow(label, field)
+    return held(form)
 
 
 _SIZE, _MARGIN = QSize(900, 640), QSize(20, 60)
@@ -598,7 +585,7 @@ class BodyPicture(QLabel):
         )
 
 
-class NewModelDialog(QDialog):
+class NewModelDialog(Dialog):
     """Ask page by page what to learn a model from, and how.
 
     Signals
@@ -622,9 +609,7 @@ class NewModelDialog(QDialog):
     started = Signal(object, str)
 
     def __init__(self, work: LongWork, settings: Settings, parent: QWidget) -> None:
-        super().__init__(parent)
-        self.setWindowTitle("New model")
-        Mnemonics(self)
+        super().__init__("New model", parent)
         FileDrops(self).dropped.connect(self.add)
         self.resize(_SIZE.boundedTo(screen_of(parent).size() - _MARGIN))
         self._work, self._settings = work, settings
@@ -676,22 +661,17 @@ class NewModelDialog(QDialog):
         self._stack = QStackedWidget()
         for page in self.pages:
             self._stack.addWidget(scrolling(page))
-        side = QWidget()
-        side.setFixedWidth(_PREVIEW_WIDTH)
         column = vbox(self.preview, self._facts, spacing=CLOSE)
         column.setStretchFactor(self.preview, 1)
-        side.setLayout(column)
+        side = held(column)
+        side.setFixedWidth(_PREVIEW_WIDTH)
         self.refusal = labelled("", "refusal", wraps=True)
-        cancel = QPushButton("Cancel")
-        self.back, self.next = QPushButton("Back"), QPushButton("Next")
-        for button in (cancel, self.back):
-            button.setAutoDefault(False)
+        cancel = push_button("Cancel", clicked=self.reject)
+        self.back = push_button("Back", clicked=lambda: self._go_to(self._stack.currentIndex() - 1))
+        self.next = push_button("Next", clicked=self._go_on)
         self.next.setDefault(True)
         # Qt's size hint is too small for the bold text.
         self.next.setMinimumWidth(_NEXT_WIDTH)
-        cancel.clicked.connect(self.reject)
-        self.back.clicked.connect(lambda: self._go_to(self._stack.currentIndex() - 1))
-        self.next.clicked.connect(self._go_on)
         buttons = hbox(cancel, self.refusal, self.back, self.next, wide=self.refusal)
         self.refusal.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
         middle = hbox(self._stack, side, wide=self._stack, spacing=WIDE)

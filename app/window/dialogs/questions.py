@@ -15,6 +15,7 @@ from PySide6.QtWidgets import (
     QGridLayout,
     QInputDialog,
     QLabel,
+    QLayout,
     QLineEdit,
     QMessageBox,
     QPlainTextEdit,
@@ -26,7 +27,7 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import NORMAL, WIDE, current_theme, pixmap
 from app.window.event_filters import Mnemonics
-from app.window.widgets import ThemedIcon, dialog_vbox, hbox, labelled, vbox
+from app.window.widgets import ThemedIcon, dialog_vbox, hbox, labelled, push_button, vbox
 from app.work.log import log_file
 from app.work.threads import Failure
 from lcollision_core.tasks.words import counted, heading, menu_text, one_line, with_capital
@@ -47,6 +48,43 @@ _WIDTH = 400
 """Minimum width, so that no title is cut off."""
 
 _Role = QMessageBox.ButtonRole
+
+
+class Dialog(QDialog):
+    """A dialog with mnemonics.
+
+    Parameters
+    ----------
+    title : of its window
+    parent : window of the dialog
+    """
+
+    def __init__(self, title: str, parent: QWidget | None) -> None:
+        super().__init__(parent)
+        self.setWindowTitle(title)
+        Mnemonics(self)
+
+    def lay_out(
+        self, *items: QWidget | QLayout, accept: str, grows: int | None = None
+    ) -> QPushButton:
+        """Lay out items above Cancel and the button that accepts, and return this button.
+
+        Parameters
+        ----------
+        accept : text of the button
+        grows : index of the item that takes the remaining height
+        """
+        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
+        button = buttons.addButton(accept, QDialogButtonBox.ButtonRole.AcceptRole)
+        buttons.accepted.connect(self.accept)
+        buttons.rejected.connect(self.reject)
+        column = dialog_vbox(*items, buttons)
+        if grows is not None:
+            column.setStretch(grows, 1)
+        self.setLayout(column)
+        # Set only once the button is in the dialog: otherwise Enter would cancel.
+        button.setDefault(True)
+        return button
 
 
 class Choice(Enum):
@@ -390,7 +428,7 @@ def why_no_model_name(name: str) -> str:
     return ""
 
 
-class FailureDialog(QDialog):
+class FailureDialog(Dialog):
     """Show a failure without blocking the window.
 
     Parameters
@@ -400,9 +438,7 @@ class FailureDialog(QDialog):
     """
 
     def __init__(self, failure: Failure, parent: QWidget | None = None) -> None:
-        super().__init__(parent)
-        self.setWindowTitle("Couldn't do that")
-        Mnemonics(self)
+        super().__init__("Couldn't do that", parent)
         self.setMinimumWidth(480)
         self.failure = failure
         what, advice = map(with_capital, map(one_line, (failure.headline, failure.next_step)))
@@ -418,14 +454,11 @@ class FailureDialog(QDialog):
         self.details.hide()
         words = vbox(self.what, self.advice, spacing=NORMAL)
         top = hbox(sign, words, spacing=WIDE)
-        self.unfold = QPushButton("Show details")
+        self.unfold, log = push_button("Show details"), push_button("Open log file")
         self.unfold.setCheckable(True)
-        log = QPushButton("Open log file")
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         buttons.addButton(self.unfold, QDialogButtonBox.ButtonRole.ActionRole)
         buttons.addButton(log, QDialogButtonBox.ButtonRole.ActionRole)
-        for button in (self.unfold, log):
-            button.setAutoDefault(False)
         buttons.button(QDialogButtonBox.StandardButton.Close).setDefault(True)
         self.setLayout(dialog_vbox(top, self.details, buttons))
         self.unfold.toggled.connect(self._on_unfold)

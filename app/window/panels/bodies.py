@@ -14,7 +14,6 @@ from PySide6.QtWidgets import (
     QComboBox,
     QDoubleSpinBox,
     QHeaderView,
-    QPushButton,
     QTreeWidget,
     QTreeWidgetItem,
     QVBoxLayout,
@@ -23,7 +22,7 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import TIGHT
 from app.window.layout import Docking
-from app.window.widgets import hbox, labelled
+from app.window.widgets import described, hbox, held, labelled, push_button
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -85,17 +84,16 @@ class BodiesPanel(QWidget):
         header.setStretchLastSection(False)
         header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
         header.setSectionResizeMode(_NAME, QHeaderView.ResizeMode.Stretch)
-        self.save = QPushButton("Save scene…")
-        self.save.setToolTip("Save the scene: its files and their positions")
+        tip = "Save the scene: its files and their positions"
+        self.save = push_button("Save scene…", tip)
         self.save.clicked.connect(self.save_wanted)
-        self.clip = QComboBox()
-        self.clip.setToolTip("Which of its clips the chosen body plays")
-        self.start = QDoubleSpinBox(suffix=" s", decimals=2, maximum=3600.0, singleStep=0.1)
-        self.start.setToolTip("When the clip of the chosen body begins")
-        self.playing = QWidget()
-        self.playing.setLayout(
-            hbox(labelled("Plays"), self.clip, labelled("at"), self.start, spacing=TIGHT)
+        self.clip = described(QComboBox(), "Which of its clips the chosen body plays")
+        self.start = described(
+            QDoubleSpinBox(suffix=" s", decimals=2, maximum=3600.0, singleStep=0.1),
+            "When the clip of the chosen body begins",
         )
+        row = hbox(labelled("Plays"), self.clip, labelled("at"), self.start, spacing=TIGHT)
+        self.playing = held(row)
         layout = QVBoxLayout(self)
         layout.addWidget(self.tree)
         layout.addWidget(self.playing)

@@ -44,10 +44,13 @@ from app.window.widgets import (
     NumberBox,
     ThemedIcon,
     bar_style,
+    described,
     hbox,
+    held,
     labelled,
     longest_name,
     plain_tip,
+    push_button,
     scrolling,
     show_verdict,
     signals_blocked,
@@ -97,7 +100,6 @@ class ProbabilityMeter(QWidget):
         self.probability: float | None = None
         self._is_aside = False
         self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
-        self.setAccessibleName("Probability of a collision")
 
     def show_probability(self, probability: float | None, is_aside: bool = False) -> None:
         """Move the mark, drawn in grey if `is_aside`."""
@@ -163,11 +165,10 @@ class DomainRow(HoverRow):
         self.bar = QProgressBar(self, textVisible=False, maximum=_BAR_STEPS)
         self.bar.setMinimumWidth(_BAR_WIDTH)
         self.bar.setStyleSheet(bar_style(colour))
-        self.lock = QToolButton()
+        self.lock = described(QToolButton(), "", f"Lock {self._name}")
         self.lock.setCheckable(True)
         self.lock.setFixedSize(24, 22)
         self.lock.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
-        self.lock.setAccessibleName(f"Lock {self._name}")
         label = NameLabel(self._name)
         margins = (TIGHT + SWATCH + CLOSE, 0, 0, 0)
         if document.model.has_predictor:
@@ -241,27 +242,23 @@ class PredictionCard(Card):
         self._document = document
         self.rows: list[DomainRow] = []
         self._shown: tuple[PoseFrame | None, SelfCollisions | None] | None = None
-        self.learn = QToolButton()
-        self.learn.setObjectName("action")
+        self.learn = described(QToolButton(), learn_action.toolTip())
         self.learn.setText("Learn it…")
-        self.learn.setToolTip(learn_action.toolTip())
+        self.learn.setObjectName("action")
         self.learn.clicked.connect(learn_action.trigger)
-        self._by_rig = QWidget()
         why = labelled(_BY_RIG, "caption", wraps=True)
-        self._by_rig.setLayout(hbox(why, self.learn, wide=why))
+        self._by_rig = held(hbox(why, self.learn, wide=why))
         self._by_rig.hide()
         self.verdict = ElidedLabel("")
-        self.percent = labelled("", "aside")
-        self.meter = ProbabilityMeter()
-        for widget in (self.percent, self.meter):
-            widget.setToolTip(_TIP)
+        self.percent = described(labelled("", "aside"), _TIP)
+        self.meter = described(ProbabilityMeter(), _TIP, "Probability of a collision")
         self._missing = labelled(_MISSING, "caption", wraps=True)
         self.title = labelled("Estimate", "title")
         head = title_row(self.title, self.verdict)
         self.verdict.setObjectName("aside")
         head.addWidget(self.percent)
         self._rows = vbox(spacing=0, margins=(0, TIGHT, 0, 0))
-        self.column.addLayout(vbox(head, self.meter, self._missing, self._by_rig, self._rows))
+        self.add(vbox(head, self.meter, self._missing, self._by_rig, self._rows))
         document.model_changed.connect(self._on_model)
         document.motion.frame_changed.connect(self._on_frame)
         document.motion.exact_changed.connect(self._on_exact)
@@ -407,19 +404,17 @@ class ResolveCard(Card):
         super().__init__()
         self._document = document
         self._action = resolve_action
-        self.button = QPushButton("Resolve")
+        self.button = push_button("Resolve", clicked=resolve_action.trigger)
         self.button.setObjectName("primary")
         give_icon(self.button, "resolve", "on_accent")
-        self.options = QPushButton("Options…")
-        self.options.setToolTip("Choose how Resolve works")
-        self.cancel = QPushButton("Cancel")
-        self.cancel.setToolTip("Stop Resolve and leave the pose as it is (Escape)")
+        tip = "Choose how Resolve works"
+        self.options = push_button("Options…", tip, options_action.trigger)
+        tip = "Stop Resolve and leave the pose as it is (Escape)"
+        self.cancel = push_button("Cancel", tip, document.tasks.cancel_resolve)
         self.bar = QProgressBar(textVisible=False)
-        self.working = QWidget()
         progress = vbox(ElidedLabel("Searching for a pose…"), self.bar, spacing=TIGHT)
-        self.working.setLayout(hbox(progress, self.cancel, spacing=NORMAL))
-        self.resting = QWidget()
-        self.resting.setLayout(hbox(self.button, self.options, wide=self.button))
+        self.working = held(hbox(progress, self.cancel, spacing=NORMAL))
+        self.resting = held(hbox(self.button, self.options, wide=self.button))
         # Stack both rows, so that the layout does not jump.
         self.stack = QStackedWidget()
         self.stack.addWidget(self.resting)
@@ -427,18 +422,14 @@ class ResolveCard(Card):
         locked = "All body parts are locked: unlock one to resolve"
         self._locked = labelled(locked, "caption", wraps=True)
         self.stack.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
-        self.clearance = NumberBox(2, 0.0, 100.0 * _LARGEST_CLEARANCE, strip_zeros=True)
-        self.clearance.setToolTip(
+        self.clearance = described(
+            NumberBox(2, 0.0, 100.0 * _LARGEST_CLEARANCE, strip_zeros=True),
             "Distance that Resolve and Solid keep between body parts; parts near at rest may "
-            "come to half their rest distance"
+            "come to half their rest distance",
         )
         self._clearance_unit = 0.01
-        self.column.addWidget(self.stack)
-        self.column.addLayout(hbox(labelled("Clearance"), None, self.clearance))
-        self.column.addWidget(self._locked)
-        self.button.clicked.connect(resolve_action.trigger)
-        self.cancel.clicked.connect(document.tasks.cancel_resolve)
-        self.options.clicked.connect(options_action.trigger)
+        clearance = hbox(labelled("Clearance"), None, self.clearance)
+        self.add(self.stack, clearance, self._locked)
         resolve_action.changed.connect(self._on_action)
         document.tasks.solve_started.connect(self._on_started)
         document.tasks.solve_progressed.connect(self._on_progressed)
@@ -538,7 +529,7 @@ class OutcomeCard(Card):
         numbers.addRow(labelled("Moved", "caption"), self._moved)
         numbers.addRow(labelled("Took", "caption"), self._took)
         facts = (self.exactly_free, self.converged, self.predicted_free)
-        self.column.addLayout(vbox(*facts, numbers, self._note, spacing=TIGHT))
+        self.add(vbox(*facts, numbers, self._note, spacing=TIGHT))
         for changed in (
             document.tasks.solve_started,
             document.tasks.solve_finished,
@@ -660,15 +651,12 @@ class ExactCard(Card):
         self.verdict = labelled("", "headline", wraps=True)
         self.details = labelled("", "caption", wraps=True)
         self.source = ElidedLabel(_SOURCE)
-        self.column.addLayout(title_row("Exact check", self.source))
-        self.column.addLayout(hbox(self._sign, self.verdict, wide=self.verdict))
-        self.column.addWidget(self.details)
-        self.nearest = QPushButton("Least distance")
+        self.nearest = push_button("Least distance", clicked=self._bring_nearest)
         self.nearest.setObjectName("compact")
         self.nearest.setCheckable(True)
-        self.column.addWidget(self.nearest)
         self.nearest.toggled.connect(self._on_shown)
-        self.nearest.clicked.connect(self._on_clicked)
+        headline = hbox(self._sign, self.verdict, wide=self.verdict)
+        self.add(title_row("Exact check", self.source), headline, self.details, self.nearest)
         document.motion.exact_changed.connect(self._on_exact)
         document.motion.frame_changed.connect(self._on_frame)
         document.motion.nearest_changed.connect(self._say_nearest)
@@ -744,10 +732,10 @@ class ExactCard(Card):
 
         return length_text(DISTANCE_BOUND, millimetres_of(self._document.model))
 
-    @Slot(bool)
-    def _on_clicked(self, shown: bool) -> None:
+    @Slot()
+    def _bring_nearest(self) -> None:
         nearest = self._document.motion.nearest
-        if shown and nearest is not None:
+        if self.nearest.isChecked() and nearest is not None:
             self.points_selected.emit(nearest.points)
 
     @Slot(bool)
@@ -829,15 +817,12 @@ class ProposalCard(Card):
         super().__init__()
         self._document = document
         self.text, self.listed = (labelled("", "caption", wraps=True) for _ in range(2))
-        self.ignore, self.dismiss = QPushButton("Ignore them"), QPushButton("Not now")
-        self.ignore.clicked.connect(self._apply)
-        self.ignore.setToolTip("Don't count crossings at the tinted places; all others still count")
-        self.dismiss.clicked.connect(self._decline)
-        self.dismiss.setToolTip("Count them, and don't ask again; Edit > Contacts has them too")
-        self.column.addWidget(labelled("Places that always touch", "title"))
-        self.column.addWidget(self.text)
-        self.column.addWidget(self.listed)
-        self.column.addLayout(hbox(self.ignore, self.dismiss, None))
+        tip = "Don't count crossings at the tinted places; all others still count"
+        self.ignore = push_button("Ignore them", tip, self._apply)
+        tip = "Count them, and don't ask again; Edit > Contacts has them too"
+        self.dismiss = push_button("Not now", tip, self._decline)
+        title = labelled("Places that always touch", "title")
+        self.add(title, self.text, self.listed, hbox(self.ignore, self.dismiss, None))
         for changed in (document.tasks.rules_proposed, document.model_changed):
             changed.connect(self._show_proposed)
         document.tasks.busy_changed.connect(
@@ -897,21 +882,15 @@ _MIN_WIDTH = 250
 class CollisionPanel(QWidget):
     """A column of cards; the headline at the top and Resolve at the bottom are always visible.
 
-    Signals
-    -------
-    domain_hovered : int or None, the domain of the row under the pointer
-    faces_selected : indices of faces to tint in the view, or None
-    points_selected : (2, 3) array, two points to bring into view
-
     Parameters
     ----------
     document : followed and changed
     actions : of commands, by key; triggered by the buttons
-    """
 
-    domain_hovered = Signal(object)
-    faces_selected = Signal(object)
-    points_selected = Signal(object)
+    Attributes
+    ----------
+    exact, proposal, prediction, resolve, outcome : the cards
+    """
 
     docking = Docking(
         "collision",
@@ -940,10 +919,6 @@ class CollisionPanel(QWidget):
         headline = vbox(self.exact, margins=(CLOSE, TIGHT, CLOSE, 0))
         remedy = vbox(self.resolve, margins=(CLOSE, 0, CLOSE, CLOSE))
         self.setLayout(vbox(headline, self._area, remedy))
-        self.exact.points_selected.connect(self.points_selected)
-        for card in (self.exact, self.proposal):
-            card.faces_selected.connect(self.faces_selected)
-        self.prediction.domain_hovered.connect(self.domain_hovered)
         document.history.outcome_changed.connect(self._on_outcome)
 
     @Slot()

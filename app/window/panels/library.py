@@ -41,7 +41,17 @@ from app.view.camera import preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT
 from app.view.thumbnail import thumbnail_pixmap
 from app.window.layout import Docking, bring_up
-from app.window.widgets import ElidedLabel, Slider, hbox, labelled, plain_tip, signals_blocked, vbox
+from app.window.widgets import (
+    ElidedLabel,
+    Slider,
+    described,
+    hbox,
+    held,
+    labelled,
+    plain_tip,
+    signals_blocked,
+    vbox,
+)
 from app.work.threads import single_shot
 from lcollision_core.tasks.words import menu_text, one_line
 
@@ -201,8 +211,8 @@ class LibraryPanel(QWidget):
         self.starter.setProperty("place", "middle")
         self.own = self._source_button("Library", "Your own poses of this model")
         self.of_file = self._source_button("This file", "The poses of the file that is open")
-        self.search = QLineEdit(placeholderText="Find a pose", clearButtonEnabled=True)
-        self.search.setAccessibleName("Find a pose by name or tag")
+        search = QLineEdit(placeholderText="Find a pose", clearButtonEnabled=True)
+        self.search = described(search, "", "Find a pose by name or tag")
         self.search.setMinimumWidth(70)
         self.search.setMaximumWidth(240)
         self.tags = QToolButton(popupMode=QToolButton.ToolButtonPopupMode.InstantPopup)
@@ -216,14 +226,14 @@ class LibraryPanel(QWidget):
         self._target = ElidedLabel("Select a pose to blend")
         self._target.setObjectName("caption")
         self._share = labelled("", "caption")
-        self.blend = Slider()
+        self.blend = described(
+            Slider(),
+            "Drag to blend the pose towards the selected one; the next drag starts where this one "
+            "ends",
+            "Blend towards the selected pose",
+        )
         self.blend.setRange(0, _BLEND_STEPS)
         self.blend.setEnabled(False)
-        self.blend.setAccessibleName("Blend towards the selected pose")
-        self.blend.setToolTip(
-            "Drag to blend the pose towards the selected one; the next drag starts where this one "
-            "ends"
-        )
         self._lay_out()
         self.training.setChecked(True)
         self._sources.buttonToggled.connect(self._on_source)
@@ -250,9 +260,8 @@ class LibraryPanel(QWidget):
         bar.setStretchFactor(self.search, 1)
         target = hbox(self._target, self._share, wide=self._target)
         rows = (self.keep, self.update_button, self.add_button, self.blend)
-        side = QWidget()
+        side = held(vbox(*rows[:3], None, target, self.blend, spacing=TIGHT))
         side.setFixedWidth(182)
-        side.setLayout(vbox(*rows[:3], None, target, self.blend, spacing=TIGHT))
         poses = hbox(side, self.list, wide=self.list, spacing=NORMAL)
         page = vbox(bar, poses, margins=(NORMAL, TIGHT, NORMAL, CLOSE))
         page.setStretchFactor(poses, 1)

@@ -24,6 +24,7 @@ from app.window.widgets import (
     NameLabel,
     NumberBox,
     Slider,
+    described,
     hbox,
     labelled,
     longest_name,
@@ -236,13 +237,9 @@ class CodeRow(HoverRow):
             source = next(g for g in space.groups if code < g.codes.stop).code_names[index]
         named = f"{name} ({source})" if source != name else name
         full = name if is_shape else heading(code_name(document.model, code))
-        self.slider.setAccessibleName(full)
+        tip = f"{named}: drag to move, hold Ctrl to move ten times finer, double-click to reset"
+        described(self.slider, plain_tip(tip), full)
         self.field.setAccessibleName(f"{full}, number")
-        self.slider.setToolTip(
-            plain_tip(
-                f"{named}: drag to move, hold Ctrl to move ten times finer, double-click to reset"
-            )
-        )
         line = hbox(label, self.slider, self.field, wide=self.slider, margins=(TIGHT, 0, TIGHT, 0))
         line.setStretchFactor(label, NAME_SHARE)
         self.setLayout(line)
@@ -365,10 +362,9 @@ class GroupHeader(HoverRow):
 
     def __init__(self, name: str, colour: str, domain: int | None) -> None:
         super().__init__(domain, colour, TIGHT + _ARROW + CLOSE)
-        self.button = QToolButton()
+        self.button = described(QToolButton(), "", name)
         self.button.setObjectName("arrow")
         self.button.setCheckable(True)
-        self.button.setAccessibleName(name)
         self.button.setFixedSize(_ARROW, _ARROW)
         self.button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         self.button.toggled.connect(self._on_toggled)
@@ -407,8 +403,8 @@ class SliderGroup(QWidget):
         self.rows: list[CodeRow] = []
         self._captions: list[QWidget] = []
         self.header = GroupHeader(heading(group.name), group.colour or "", self._domain)
-        self._body = QWidget()
         self._column = vbox(spacing=0, margins=(0, 0, 0, TIGHT))
+        self._body = QWidget()
         self._body.setLayout(self._column)
         self._body.hide()
         self.setLayout(vbox(self.header, self._body, spacing=0))
@@ -512,11 +508,11 @@ class SlidersPanel(QWidget):
         self._fingerprint = ""
         self._latent_size = self._natural_width = 0
         self._request: tuple[CodeRow, float, FloatArray] | None = None
-        self.filter = QLineEdit()
-        self.filter.setPlaceholderText("Filter sliders, such as “finger”")
-        self.filter.setToolTip("Show the sliders of a part or motion, such as “left hand twist”")
-        self.filter.setAccessibleName("Filter sliders")
-        self.filter.setClearButtonEnabled(True)
+        self.filter = described(
+            QLineEdit(placeholderText="Filter sliders, such as “finger”", clearButtonEnabled=True),
+            "Show the sliders of a part or motion, such as “left hand twist”",
+            "Filter sliders",
+        )
         self._page = QWidget()
         self._nothing = labelled("No matching sliders", "caption")
         self._nothing.setContentsMargins(TIGHT, TIGHT, TIGHT, TIGHT)
@@ -658,20 +654,18 @@ class RandomiseRow(QWidget):
     def __init__(self, document: PoseDocument, action: QAction, amount: float) -> None:
         super().__init__()
         self._document = document
-        self.amount = Slider()
+        tip = "How far to go to the random pose: 100 % replaces the current pose"
+        self.amount = described(Slider(), tip, "Amount")
         self.amount.setRange(1, 100)
         self.amount.setPageStep(10)
         self.amount.setValue(round(100 * amount))
-        self.amount.setAccessibleName("Amount")
-        self.amount.setToolTip("How far to go to the random pose: 100 % replaces the current pose")
         self._percent = labelled("", "caption")
         self._percent.setMinimumWidth(self.fontMetrics().horizontalAdvance("100 %"))
         self._percent.setContentsMargins(0, 0, TIGHT, 0)
         self._percent.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
-        self.seed = NumberBox(0, 0, _LARGEST_SEED)
+        tip = "The same seed gives the same random pose; it increases by itself"
+        self.seed = described(NumberBox(0, 0, _LARGEST_SEED), tip, "Seed")
         self.seed.setFixedWidth(_SEED_WIDTH)
-        self.seed.setAccessibleName("Seed")
-        self.seed.setToolTip("The same seed gives the same random pose; it increases by itself")
         self.seed.setButtonSymbols(NumberBox.ButtonSymbols.NoButtons)
         self.button = QToolButton()
         self.button.setDefaultAction(action)

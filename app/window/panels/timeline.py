@@ -13,7 +13,6 @@ from PySide6.QtWidgets import (
     QLayout,
     QMenu,
     QProgressBar,
-    QPushButton,
     QSizePolicy,
     QToolButton,
     QWidget,
@@ -22,7 +21,17 @@ from PySide6.QtWidgets import (
 from app.view.theme import ICON_SIZE, NORMAL, TIGHT, give_icon
 from app.window.layout import Docking, bring_up
 from app.window.panels.timeline_strip import BETWEEN, TimelineStrip
-from app.window.widgets import ElidedLabel, NumberBox, hbox, labelled, signals_blocked, vbox
+from app.window.widgets import (
+    ElidedLabel,
+    NumberBox,
+    described,
+    hbox,
+    held,
+    labelled,
+    push_button,
+    signals_blocked,
+    vbox,
+)
 from lcollision_core.tasks.words import counted, duration_text, menu_text, spent_text
 
 if TYPE_CHECKING:
@@ -65,34 +74,30 @@ class TimelinePanel(QWidget):
         super().__init__()
         self._document, self._timeline = document, document.timeline
         self.strip = TimelineStrip()
-        self.clips = QComboBox()
-        self.clips.setAccessibleName("Motion")
-        self.clips.setToolTip("Which motion is on the timeline")
         # As wide as its names; this many characters at least.
-        self.clips.setMinimumContentsLength(5)
-        self.clips.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
-        self.speed = QComboBox()
-        self.speed.setAccessibleName("Speed")
-        self.speed.setToolTip("Playback speed; 100 % is the motion's own rate")
+        clips = QComboBox(minimumContentsLength=5)
+        clips.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
+        self.clips = described(clips, "Which motion is on the timeline", "Motion")
+        tip = "Playback speed; 100 % is the motion's own rate"
+        self.speed = described(QComboBox(), tip, "Speed")
         for speed in _SPEEDS:
             self.speed.addItem(f"{100 * speed:g} %", speed)
-        self.part = QComboBox()
-        self.part.setAccessibleName("Deepest overlap of")
-        self.part.setMinimumContentsLength(7)
-        self.part.setToolTip("Whose deepest overlap the curve shows")
-        self.easing = NumberBox(0, 0, _LARGEST_EASING)
-        self.easing.setAccessibleName("Ease edits over")
-        self.easing.setToolTip("Frames (at 30 per second) over which an edit eases in and out")
-        self.place = labelled("", "caption")
-        self.place.setToolTip("The frame at the playhead, from 0, and its time")
+        tip = "Whose deepest overlap the curve shows"
+        self.part = described(QComboBox(minimumContentsLength=7), tip, "Deepest overlap of")
+        tip = "Frames (at 30 per second) over which an edit eases in and out"
+        self.easing = described(NumberBox(0, 0, _LARGEST_EASING), tip, "Ease edits over")
+        tip = "The frame at the playhead, from 0, and its time"
+        self.place = described(labelled("", "caption"), tip)
         self.place.setMinimumWidth(self.fontMetrics().horizontalAdvance("000 · 00.00 s"))
         self.facts = ElidedLabel("")
         self.facts.setObjectName("caption")
         self.bar = QProgressBar(textVisible=False)
         self.bar.setFixedWidth(_BAR_WIDTH)
-        self.keep, self.cancel = QPushButton("Keep so far"), QPushButton("Cancel")
-        self.keep.setToolTip("Stop Resolve and keep the spans of frames that are resolved")
-        self.cancel.setToolTip("Stop Resolve and leave the motion as it was (Escape)")
+        resolving = document.timeline.resolving
+        tip = "Stop Resolve and keep the spans of frames that are resolved"
+        self.keep = push_button("Keep so far", tip, resolving.keep_done)
+        tip = "Stop Resolve and leave the motion as it was (Escape)"
+        self.cancel = push_button("Cancel", tip, resolving.cancel)
         self._second = QTimer(self, interval=1000)
         self._lay_out(actions)
         timeline = self._timeline
@@ -113,8 +118,6 @@ class TimelinePanel(QWidget):
         timeline.options_changed.connect(self._follow_checks)
         timeline.resolving.changed.connect(self._follow_progress)
         self._second.timeout.connect(self._tell_checks)
-        self.keep.clicked.connect(timeline.resolving.keep_done)
-        self.cancel.clicked.connect(timeline.resolving.cancel)
         document.model_changed.connect(self._on_model)
         if document.has_model:
             self._on_model()
@@ -124,12 +127,9 @@ class TimelinePanel(QWidget):
         buttons = hbox(*(_button(actions[key]) for key in _BUTTONS), spacing=0)
         points = [_button(actions[key]) for key in ("in_point", "out_point")]
         ease = labelled("Ease", "caption")
-        looks = QToolButton(popupMode=QToolButton.ToolButtonPopupMode.InstantPopup)
-        give_icon(looks, "onion")
+        looks = QToolButton(popupMode=QToolButton.ToolButtonPopupMode.InstantPopup, autoRaise=True)
+        give_icon(described(looks, "Onion skin and path", "Onion skin and path"), "onion")
         looks.setIconSize(QSize(ICON_SIZE, ICON_SIZE))
-        looks.setAutoRaise(True)
-        looks.setToolTip("Onion skin and path")
-        looks.setAccessibleName("Onion skin and path")
         menu = QMenu(looks)
         menu.setToolTipsVisible(True)
         menu.addActions([actions[key] for key in actions if key.startswith("onion_")])
@@ -146,8 +146,7 @@ class TimelinePanel(QWidget):
         more.setToolTipsVisible(True)
         more.addActions([actions[key] for key in ("resolve_motion", "resolve_range", "resolve")])
         resolve.setMenu(more)
-        self.working = QWidget()
-        self.working.setLayout(hbox(self.bar, self.keep, self.cancel, spacing=TIGHT))
+        self.working = held(hbox(self.bar, self.keep, self.cancel, spacing=TIGHT))
         # Only the strip grows in height.
         self.working.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
         self.working.hide()
