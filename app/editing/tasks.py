@@ -28,6 +28,7 @@ from lcollision_core.tasks.words import (
     height_text,
     mirrored_name,
     mirrored_text,
+    say,
 )
 
 if TYPE_CHECKING:
@@ -617,12 +618,10 @@ class Tasks(QObject):
         else:
             worst = max(image.fit_error_max for _, image in images)
             sentences.append(f"off by at most {height_text(worst)} of the body size")
-            for count, words in (
-                (sum(i.pairs_after == 0 < i.pairs_mirrored for _, i in images), "resolved"),
-                (sum(i.collides_newly for _, i in images), "colliding, though free before"),
-            ):
-                if count:
-                    sentences.append(f"{count} {words}")
+            if n := sum(i.pairs_after == 0 < i.pairs_mirrored for _, i in images):
+                sentences.append(say("{n} resolved", n=n))
+            if n := sum(i.collides_newly for _, i in images):
+                sentences.append(say("{n} colliding, though free before", n=n))
         self.message.emit("; ".join(sentences))
 
     def _on_resolved(self, found: tuple[ResolveResult, npt.NDArray[np.float32]]) -> None:

@@ -23,7 +23,7 @@ from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
 from lcollision_core.tasks.editing import free_neighbours, resolve_frames
 from lcollision_core.tasks.opening import OpenedModel, own_motions, read_motions
-from lcollision_core.tasks.words import counted, ground_text
+from lcollision_core.tasks.words import counted, ground_text, joined, say
 
 if TYPE_CHECKING:
     from app.editing.history import PoseHistory
@@ -244,13 +244,14 @@ class MotionResolve(QObject):
             return "Stopped before a span of frames was resolved: the motion is as it was"
         if not found.spans and not found.kept:
             return "No frame collides"
-        n_left = int((~found.after).sum())
-        text = f"{counted(int((~found.before).sum()), 'frame')} collided; "
-        text += f"{n_left} still do" if n_left else "all are free now"
+        n_left, before = int((~found.after).sum()), counted(int((~found.before).sum()), "frame")
+        text = say("{frames} collided", frames=before)
+        if self.is_ending:
+            text = say("Stopped: {frames} collided", frames=before)
+        now = say("{n} still do", n=n_left) if n_left else "all are free now"
         kept_sentences = (span.sentence(part_names) for span in found.kept)
         ground = ground_text(None if found.ground is None else asdict(found.ground))
-        sentences = ["Stopped: " * self.is_ending + text, *kept_sentences, ground]
-        return "; ".join(filter(None, sentences))
+        return joined((text, now, *kept_sentences, ground))
 
     @Slot(int, int)
     def _on_progress(self, done: int, total: int) -> None:

@@ -30,7 +30,7 @@ from app.view.shading import Known, Legend, Shader, Shading
 from app.view.theme import NORMAL, Ring, current_theme
 from app.work.frames import PoseFrame
 from lcollision_core.errors import LCollisionError
-from lcollision_core.tasks.words import heading, with_capital
+from lcollision_core.tasks.words import heading, say, with_capital
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -137,8 +137,6 @@ _TURN_MILLISECONDS = 260
 """Duration of the transition from one camera view to another."""
 
 Float32Array = npt.NDArray[np.float32]
-
-_HELPED = ", whole body"
 
 _CLOSE_UP = 0.12
 """Half the side of the box framed by a close-up, as a fraction of the body size."""
@@ -733,7 +731,7 @@ class Viewport(QWidget):
         model = self._document.model
         name = heading(model.domain_names[domain])
         if self.mouse.whole_body_drag or self._document.motion.whole_body:
-            name += _HELPED
+            name = say("{part}, whole body", part=name)
         self._tag.point_at(position, name, model.card.domain_colours[domain])
         return domain
 

@@ -12,7 +12,7 @@ from PySide6.QtCore import QObject, Slot
 from PySide6.QtWidgets import QWidget
 
 from app.window.widgets import ListMenu
-from lcollision_core.tasks.words import menu_text
+from lcollision_core.tasks.words import menu_text, say
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -97,10 +97,12 @@ class HiddenMeshes(QObject):
         self._settings["hidden_meshes"] = (*others, *(key,) * hidden)[-_MOST_REMEMBERED:]
         left_out = [known for known in model.rules.left_out if known != name]
         rules = replace(model.rules, left_out=(*left_out, *(name,) * hidden))
-        text = "shown and checked"
+        told = say("{mesh} is shown and checked", mesh=name)
         if hidden:
-            text = "hidden and not checked; it is still posed and exported"
-        self._document.tasks.set_rules(rules, f"{name} is {text}")
+            told = say(
+                "{mesh} is hidden and not checked; it is still posed and exported", mesh=name
+            )
+        self._document.tasks.set_rules(rules, told)
 
     def _key(self, name: str) -> str:
         return f"{self._document.model.fingerprint} {name}"

@@ -18,7 +18,7 @@ from app.work import learning_runs
 from app.work.learning_runs import LearningRun, LearningRuns
 from app.work.threads import LongWork
 from lcollision_core.learning_state import RunState
-from lcollision_core.tasks.words import duration_text, menu_text, one_line
+from lcollision_core.tasks.words import duration_text, menu_text, one_line, say
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -176,7 +176,9 @@ class LearningActions(QObject):
         self.indicator.setVisible(run is not None)
         if run is not None:
             others = len(self.runs.runs) - 1
-            text = indicator_text(run) + (f" (and {others} more)" if others else "")
+            text = indicator_text(run)
+            if others:
+                text = say("{run} (and {n} more)", run=text, n=others)
             # Elide the text: a status bar is never narrower than its widgets.
             most = round(_INDICATOR_SHARE * self._window.width())
             cut = self.indicator.fontMetrics().elidedText(text, Qt.TextElideMode.ElideRight, most)

@@ -37,7 +37,7 @@ from app.window.panels.library import LibraryPanel
 from app.window.panels.sliders import RandomiseRow, SlidersPanel
 from app.window.panels.timeline import TimelinePanel
 from app.work.preparing import Preparing
-from lcollision_core.tasks.words import one_line
+from lcollision_core.tasks.words import one_line, say
 
 if TYPE_CHECKING:
     import numpy as np
@@ -290,7 +290,9 @@ class MainWindow(EditorWindow):
         if not document.has_model:
             self.setWindowTitle("LCollision")
             return
-        name = document.history.pose.name + ", changed" * document.history.changed
+        name = document.history.pose.name
+        if document.history.changed:
+            name = say("{pose}, changed", pose=name)
         file = f" — {document.history.file.name}" if document.history.file is not None else ""
         self.setWindowTitle(one_line(f"{name}{file}[*] — {document.model.name}"))
         self.setWindowModified(document.history.modified)

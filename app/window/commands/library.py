@@ -18,7 +18,7 @@ from app.window.dialogs.forms import MotionDialog, run_form
 from app.window.dialogs.questions import ask_for_name, ask_to_replace
 from app.work.threads import as_task
 from lcollision_core.tasks.editing import save_poses
-from lcollision_core.tasks.words import counted, menu_text
+from lcollision_core.tasks.words import counted, menu_text, say
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import NamedPose
@@ -104,8 +104,9 @@ def _update_text(window: EditorWindow) -> str:
 
 def _add_text(window: EditorWindow) -> str:
     addable = _addable(window)
-    poses = window.library.chosen_poses or not addable
-    return f"Add &{'selected' if poses else f'all {len(addable)}'} to library"
+    if window.library.chosen_poses or not addable:
+        return "Add &selected to library"
+    return say("Add &all {n} to library", n=len(addable))
 
 
 @LIBRARY.command("load", "&Load selected pose", "Ctrl+Return", "Edit the selected pose")
@@ -145,8 +146,10 @@ def _rename(window: EditorWindow) -> None:
 def _tag(window: EditorWindow) -> None:
     poses = window.library.chosen_poses
     shared = [tag for tag in poses[0].tags if all(tag in pose.tags for pose in poses)]
-    which = "Tags of" if len(poses) == 1 else "Tags that are shared by"
-    label = f"{which} {_called(poses)}, with commas between them:"
+    label = say("Tags of {poses}, with commas between them:", poses=_called(poses))
+    if len(poses) > 1:
+        named = _called(poses)
+        label = say("Tags that are shared by {poses}, with commas between them:", poses=named)
 
     def refuse(text: str) -> str:
         return _why_no_tags(max((retagged(p, _split(text), shared) for p in poses), key=len))

@@ -43,10 +43,9 @@ def _why_not_filmed(window: EditorWindow) -> str:
     if window.document.timeline.motion is None:
         return _NO_MOTION
     by_frame = (Shading.EXACT, Shading.PREDICTED, Shading.MOVEMENT)
-    is_of_frame = window.viewport.shading in by_frame
-    return "Choose a shading that is the same in all frames: plain, body parts or textured" * (
-        is_of_frame
-    )
+    if window.viewport.shading not in by_frame:
+        return ""
+    return "Choose a shading that is the same in all frames: plain, body parts or textured"
 
 
 @MOTION.command(

@@ -44,7 +44,10 @@ if TYPE_CHECKING:
 
 _WIDTH, _BORDER = 400, WIDE + 4
 _COUNTING = "Counting pairs at rest…"
-_FOLDS = "Pairs this close along the surface"
+_FOLDS = {
+    False: "Pairs this close along the surface",
+    True: "Pairs this close along the surface, less at thin limbs",
+}
 _PERCENT = 100.0
 _MOST = {"near": 50.0, "rest": 50.0, "tolerated": 10.0}
 """Upper limits in per cent of the body size; beyond them hardly any pair would count."""
@@ -113,7 +116,7 @@ class ContactsDialog(Dialog):
         self.counts = {name: labelled("", "caption") for name in names}
         for label in self.counts.values():
             label.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
-        self.folds, self.total = self._note(_FOLDS), self._note(_COUNTING)
+        self.folds, self.total = self._note(_FOLDS[False]), self._note(_COUNTING)
         self._tint = QLabel(with_swatch(_TINT, UNCOUNTED_FACE))
         self._tint.setObjectName("caption")
         self.kept = self._note("")
@@ -340,7 +343,7 @@ class ContactsDialog(Dialog):
     @Slot()
     def _on_edited(self) -> None:
         model = self._document.model
-        self._write(self.folds, _FOLDS + ", less at thin limbs" * self._near_by_limb())
+        self._write(self.folds, _FOLDS[self._near_by_limb()])
         can_change = not model.has_predictor
         for widget in (self.near, self.at_rest, self.tolerated, self.ignored, self.propose):
             widget.setEnabled(can_change)

@@ -227,8 +227,10 @@ def video_form(settings: Settings, parent: QWidget, of_motion: bool = False) -> 
         behind.setItemData(index, 0 if is_gif else None, Qt.ItemDataRole.UserRole - 1)
         if is_gif and behind.currentIndex() == index:
             behind.setCurrentIndex(0)
-        what = "From in to out point" if of_motion else "One full turn"
-        form.explain(note, f"{what}, current shading. {meanings[kind.currentData()]}")
+        what = "One full turn, current shading."
+        if of_motion:
+            what = "From in to out point, current shading."
+        form.explain(note, f"{what} {meanings[kind.currentData()]}")
 
     def show_colour() -> None:
         colour.setEnabled(behind.currentData() == "plain")

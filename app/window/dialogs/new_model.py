@@ -53,6 +53,7 @@ from lcollision_core.tasks.words import (
     duration_text,
     grouped,
     one_line,
+    say,
     spent_text,
     with_capital,
 )
@@ -327,12 +328,14 @@ class PosesPage(Page):
         values = self.values()
         frames = summary.n_given(values["clip"], values["fps"]) - summary.n_poses
         self._from_clips.setText(f"Uses {counted(frames, 'animation frame')} as poses.")
-        size = f"The longest side of the body is {summary.size:.4g} in its file"
+        size, scaled = summary.size, summary.size * values["scale"]
+        length = f"{size:.4g}"
         if summary.metres is not None:
-            size += f" ({summary.size * summary.metres:.2f} m)"
+            length = say("{size} ({metres:.2f} m)", size=length, metres=size * summary.metres)
+        text = say("The longest side of the body is {length} in its file.", length=length)
         if values["scale"] != 1.0:
-            size += f", {summary.size * values['scale']:.4g} in the model"
-        self._size.setText(f"{size}.")
+            text = f"{text} {say('In the model it is {size:.4g}.', size=scaled)}"
+        self._size.setText(text)
         self.changed.emit()
 
     @Slot()

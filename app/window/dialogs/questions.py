@@ -30,7 +30,7 @@ from app.window.event_filters import Mnemonics
 from app.window.widgets import ThemedIcon, dialog_vbox, hbox, labelled, push_button, vbox
 from app.work.log import log_file
 from app.work.threads import Failure
-from lcollision_core.tasks.words import counted, heading, menu_text, one_line, with_capital
+from lcollision_core.tasks.words import counted, heading, menu_text, one_line, say, with_capital
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -144,20 +144,27 @@ def ask_about_recovery(parent: QWidget, lost: RecoverablePose) -> Choice:
     answer : SAVE to recover it, DISCARD to delete it, CANCEL to be asked again next time
     """
     moment = datetime.fromtimestamp(lost.saved).astimezone()
-    kind, name, missing = "pose", lost.pose_name, "saved"
-    if lost.motion:
-        kind, name, missing = "motion", lost.motion, "exported"
-    text = (
-        f"The editor closed unexpectedly while the {kind} “{name}” of “{lost.model_name}” was not "
-        f"{missing}."
+    title, model = "Recover a pose", lost.model_name
+    text = say(
+        "The editor closed unexpectedly while the pose “{name}” of “{model}” was not saved.",
+        name=lost.pose_name,
+        model=model,
     )
+    if lost.motion:
+        title = "Recover a motion"
+        text = say(
+            "The editor closed unexpectedly while the motion “{name}” of “{model}” was not "
+            "exported.",
+            name=lost.motion,
+            model=model,
+        )
     note = f"It was saved automatically on {moment.day} {moment:%B at %H:%M}. Recover it?"
     if lost.motion_loss_reason:
         note = (
             f"As {lost.motion_loss_reason}, only the pose “{lost.pose_name}” can be recovered, "
             "not the edits of the motion. Recover it?"
         )
-    return _ask(parent, f"Recover a {kind}", text, note, ("Recover", "Delete it", "Ask later"))
+    return _ask(parent, title, text, note, ("Recover", "Delete it", "Ask later"))
 
 
 def ask_about_changed_file(parent: QWidget, file: str) -> Choice:
@@ -188,7 +195,9 @@ def ask_to_switch(parent: QWidget, file: str, model: str, differs: str = "") -> 
     ----------
     differs : how the model differs, if it has the same name as the open one; "" otherwise
     """
-    text = f"{file} {differs or f'contains poses of the model “{model}”'}."
+    text = say("{file} contains poses of the model “{model}”.", file=file, model=model)
+    if differs:
+        text = f"{file} {differs}."
     note = f"Open “{model}” with these poses?"
     buttons = (f"Open “{menu_text(model)}”", "", "Cancel")
     return _ask(parent, "Poses of another model", text, note, buttons) is Choice.SAVE
@@ -263,9 +272,14 @@ def wait_for_exports(parent: QWidget, document: PoseDocument, pictures: Pictures
 def ask_to_replace_files(parent: QWidget, files: Sequence[Path]) -> bool:
     """Ask whether to replace files beside the chosen one."""
     names = ", ".join(f"“{file.name}”" for file in files[:_NAMED])
-    more = f" and {len(files) - _NAMED} more" if len(files) > _NAMED else ""
     text = "Replace existing files?"
-    note = f"Each mesh of the character gets a file of its own, replacing {names}{more}."
+    note = say("Each mesh of the character gets a file of its own, replacing {files}.", files=names)
+    if len(files) > _NAMED:
+        note = say(
+            "Each mesh of the character gets a file of its own, replacing {files} and {n} more.",
+            files=names,
+            n=len(files) - _NAMED,
+        )
     buttons = ("Replace", "", "Cancel")
     answer = _ask(parent, "Replace files", text, note, buttons, Choice.CANCEL)
     return answer is Choice.SAVE

@@ -63,6 +63,8 @@ from lcollision_core.tasks.words import (
     height_text,
     length_text,
     overlap_text,
+    say,
+    say_number,
     seconds_text,
     with_capital,
 )
@@ -345,11 +347,14 @@ _ICONS_OF_ANSWERS = {
 }
 """Icon and colour for yes, no and unknown."""
 
-_CHECKED = {True: "No collisions (checked)", False: "Still colliding", None: "Not checked"}
 _ESTIMATED = {
     True: "Estimate: probably clear",
     False: "Estimate: probably colliding",
     None: "No estimate: this body has no predictor",
+}
+_OVERRULED = {
+    True: "Estimate: probably clear, overruled",
+    False: "Estimate: probably colliding, overruled",
 }
 
 
@@ -553,20 +558,9 @@ class OutcomeCard(Card):
 
         ran = result.solver_status != "not run"
         exactly_free, predicted_free = result.exactly_free, result.predicted_free
-        checked = _CHECKED[exactly_free]
-        least, clearance = result.least_distance, result.clearance
-        millimetres = millimetres_of(self._document.model)
-        if clearance > 0.0 and exactly_free is not None:
-            if exactly_free and least is not None:
-                checked += f", least distance {length_text(least, millimetres)}"
-            elif not exactly_free and least is not None and least >= 0.0:
-                checked = f"Nearer than {length_text(clearance, millimetres)}"
-        if result.step == Step.SOFT and not exactly_free:
-            deepest = length_text(result.deepest_after or 0.0, millimetres)
-            checked += f": {counted(result.pairs_after or 0, 'pair')}, by up to {deepest}"
-        self.exactly_free.say(checked, exactly_free)
+        self.exactly_free.say(self._checked(result), exactly_free)
         # With a clearance, the energy measures how much pairs lack of it.
-        self._measure.setText("Lacks clearance" if clearance > 0.0 else "Overlap")
+        self._measure.setText("Lacks clearance" if result.clearance > 0.0 else "Overlap")
         if ran and exactly_free:
             # Even if the search was cut short, a free pose is a success.
             search = "The search found a pose without collisions"
@@ -580,8 +574,9 @@ class OutcomeCard(Card):
             search = "No search was needed"
         self.converged.say(search, bool(exactly_free or result.converged) if ran else None)
         estimate = _ESTIMATED[predicted_free]
-        overruled = None not in (exactly_free, predicted_free) and exactly_free != predicted_free
-        self.predicted_free.say(estimate + ", overruled" * overruled, predicted_free)
+        if None not in (exactly_free, predicted_free) and exactly_free != predicted_free:
+            estimate = _OVERRULED[bool(predicted_free)]
+        self.predicted_free.say(estimate, predicted_free)
         self.predicted_free.setVisible(self._document.model.has_predictor)
         if result.energy_before is None or result.energy_after is None:
             self._energy.setText("not measured")
@@ -597,6 +592,32 @@ class OutcomeCard(Card):
         self._took.setText(_times(result.seconds, self._document.history.state.outcome_seconds))
         self._note.setText(heading(result.note or ""))
         self._note.setVisible(bool(result.note))
+
+    def _checked(self, result: ResolveResult) -> str:
+        """Word what the exact check says of the pose that Resolve found."""
+        from lcollision_core.resolve import Step
+
+        if result.exactly_free is None:
+            return "Not checked"
+        millimetres = millimetres_of(self._document.model)
+        least, has_clearance = result.least_distance, result.clearance > 0.0
+        if result.exactly_free:
+            if not has_clearance or least is None:
+                return "No collisions (checked)"
+            distance = length_text(least, millimetres)
+            return say("No collisions (checked), least distance {distance}", distance=distance)
+        verdict = "Still colliding"
+        if has_clearance and least is not None and least >= 0.0:
+            clearance = length_text(result.clearance, millimetres)
+            verdict = say("Nearer than {clearance}", clearance=clearance)
+        if result.step != Step.SOFT:
+            return verdict
+        return say(
+            "{verdict}: {pairs}, by up to {depth}",
+            verdict=verdict,
+            pairs=counted(result.pairs_after or 0, "pair"),
+            depth=length_text(result.deepest_after or 0.0, millimetres),
+        )
 
 
 def millimetres_of(model: Body) -> float | None:
@@ -766,7 +787,7 @@ class ExactCard(Card):
         elif is_held:
             sentences.append(_HELD)
         else:
-            sentences.append(f"No {'other ' if left_out else ''}triangles cross")
+            sentences.append("No other triangles cross" if left_out else "No triangles cross")
         rules = document.model.rules
         if rules.left_out:
             sentences.append(with_capital(rules.left_out_in_words()))
@@ -839,20 +860,25 @@ class ProposalCard(Card):
         if proposed is None or not self._document.tasks.offers_rules:
             self._end()
             return
-        then = proposed.n_colliding_then
-        remaining = "no pose collides"
+        then, places = proposed.n_colliding_then, counted(len(proposed.new), "such place")
+        remaining = say("With {places} ignored, no pose collides.", places=places)
         if then:
-            verb = "collides" if then == 1 else "collide"
-            remaining = f"{counted(then, 'pose')} still {verb} elsewhere"
-        self.text.setText(
-            f"{proposed.n_colliding} of {counted(proposed.n_poses, 'pose')} collide, and the "
-            f"same parts touch in nearly all of them. With "
-            f"{counted(len(proposed.new), 'such place')} ignored, {remaining}."
+            remaining = say_number(
+                then,
+                "With {places} ignored, {n} pose still collides elsewhere.",
+                "With {places} ignored, {n} poses still collide elsewhere.",
+                places=places,
+            )
+        now = say(
+            "{n} of {poses} collide, and the same parts touch in nearly all of them.",
+            n=proposed.n_colliding,
+            poses=counted(proposed.n_poses, "pose"),
         )
+        self.text.setText(f"{now} {remaining}")
         lines = [
             f"{pair_in_words(pair)}: {counted(n, 'place')}" for pair, n in proposed.places.items()
         ]
-        more = [f"and {len(lines) - _LISTED} more"] if len(lines) > _LISTED else []
+        more = [say("and {n} more", n=len(lines) - _LISTED)] if len(lines) > _LISTED else []
         self.listed.setText("\n".join([*lines[:_LISTED], *more]))
         self.show()
         self.faces_selected.emit(proposed.faces)

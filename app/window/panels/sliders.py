@@ -34,7 +34,7 @@ from app.window.widgets import (
     signals_blocked,
     vbox,
 )
-from lcollision_core.tasks.words import heading
+from lcollision_core.tasks.words import heading, joined, say
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -211,8 +211,7 @@ class CodeRow(HoverRow):
         self._name = name = model.code_names[code] if is_shape else heading(model.code_names[code])
         space = model.latent_space
         self._range = low, high = float(space.low[code]), float(space.high[code])
-        whose = "shape's" if is_shape else "joint's"
-        self._kind_of_range = "trained range" if model.is_trained else f"{whose} range"
+        self._is_trained, self._is_shape = model.is_trained, is_shape
         # Factor and unit in which the field shows a code, such as degrees.
         self._shown, self._unit = float(space.shown[code]), space.units[code]
         # Elide the middle: the end of a name says how the body part moves.
@@ -306,11 +305,16 @@ class CodeRow(HoverRow):
             self.field.textFromValue(self._shown * number) + self._unit
             for number in (low, high, *self._limits)
         )
-        words = f"type a number from {limits[0]} to {limits[1]}"
-        if outside:
-            words += f"; this one is outside the {self._kind_of_range}, {least} to {most}"
-        if is_held:
-            words = f"stopped by contact; {words}"
+        ends = {"low": least, "high": most}
+        words = say("type a number from {low} to {high}", low=limits[0], high=limits[1])
+        beyond = ""
+        if outside and self._is_trained:
+            beyond = say("this one is outside the trained range, {low} to {high}", **ends)
+        elif outside and self._is_shape:
+            beyond = say("this one is outside the shape's range, {low} to {high}", **ends)
+        elif outside:
+            beyond = say("this one is outside the joint's range, {low} to {high}", **ends)
+        words = joined(("stopped by contact" if is_held else "", words, beyond))
         self.field.setToolTip(plain_tip(f"{self._name}: {words}"))
 
     def show_contact_limit(self, number: float | None) -> None:

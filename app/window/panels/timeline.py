@@ -32,7 +32,15 @@ from app.window.widgets import (
     signals_blocked,
     vbox,
 )
-from lcollision_core.tasks.words import counted, duration_text, menu_text, spent_text
+from lcollision_core.tasks.words import (
+    counted,
+    duration_text,
+    joined,
+    menu_text,
+    say,
+    spent_text,
+    with_capital,
+)
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -233,9 +241,10 @@ class TimelinePanel(QWidget):
             return
         self.place.setText(f"{frame} · {motion.times[frame]:.2f} s")
         if playback.playing and playback.rate:
-            text = f"{playback.rate:.0f} of {motion.rate * playback.speed:g} frames a second"
-            if playback.n_dropped:
-                text += f", {playback.n_dropped} dropped"
+            rate, whole, n = playback.rate, motion.rate * playback.speed, playback.n_dropped
+            text = say("{rate:.0f} of {whole:g} frames a second", rate=rate, whole=whole)
+            if n:
+                text = say("{speed}, {n} dropped", speed=text, n=n)
             self.facts.setText(text)
 
     @Slot()
@@ -291,9 +300,12 @@ class TimelinePanel(QWidget):
             return "Stopping…"
         left, frames = progress.seconds_left, counted(progress.total, "frame")
         if left is not None:
-            return f"{progress.done} of {frames}, {duration_text(left)} left"
-        what = f"0 of {frames}" if progress.total else "Checking frames"
-        return f"{what}, {spent_text(progress.seconds)} so far"
+            done, duration = progress.done, duration_text(left)
+            return say("{n} of {frames}, {time} left", n=done, frames=frames, time=duration)
+        spent = spent_text(progress.seconds)
+        if progress.total:
+            return say("0 of {frames}, {time} so far", frames=frames, time=spent)
+        return say("Checking frames, {time} so far", time=spent)
 
     @Slot()
     def _tell_checks(self) -> None:
@@ -309,25 +321,36 @@ class TimelinePanel(QWidget):
         n = len(checks.deepest)
         deep = np.nan_to_num(checks.deepest)
         n_colliding, n_between = int((deep > 0.0).sum()), int(checks.between.sum())
+        frames, facts = counted(n, "frame"), ["no collisions"]
         if n_colliding:
-            text = f"{n_colliding} of {counted(n, 'frame')} collide, at most "
-            text += f"{100.0 * deep.max():.1f} % deep"
-        else:
-            text = "no collisions"
+            facts = [
+                say(
+                    "{n} of {frames} collide, at most {depth:.1f} % deep",
+                    n=n_colliding,
+                    frames=frames,
+                    depth=100.0 * deep.max(),
+                )
+            ]
         if n_between:
-            text += f"; {BETWEEN} {counted(n_between, 'collision')} between frames"
-        if checks.n_checked < n:
-            so_far = f"{checks.n_checked} of {counted(n, 'frame')} checked"
-            text = f"{so_far}: {text}" if checks.n_checked else so_far
-        if timeline.comparing:
-            text = f"as it was read: {text}" if checks.n_checked else "as it was read"
-        left_out = checks.left_out
-        text = text[0].upper() + text[1:]
+            collisions = counted(n_between, "collision")
+            facts.append(say("{mark} {n} between frames", mark=BETWEEN, n=collisions))
+        heads = ["as it was read"] if timeline.comparing else []
+        if checks.n_checked < n and (checks.n_checked or not heads):
+            heads.append(say("{n} of {frames} checked", n=checks.n_checked, frames=frames))
+        if checks.n_checked:
+            heads.append(joined(facts))
+        text, left_out = with_capital(": ".join(heads)), checks.left_out
         if left_out.frames:
             # On its own line, to be visible in a small window; the tool tip has the details.
-            of = "" if left_out.step == 1 else f"{left_out.frames} of "
-            frames = counted(left_out.frames if left_out.step == 1 else left_out.searched, "frame")
-            text += f"\nPairs not counted in {of}{frames}, up to {100.0 * left_out.deepest:.2f} %"
+            n, depth = left_out.frames, 100.0 * left_out.deepest
+            frames = counted(n, "frame")
+            if left_out.step > 1:
+                searched = counted(left_out.searched, "frame")
+                frames = say("{n} of {frames}", n=n, frames=searched)
+            line = say(
+                "Pairs not counted in {frames}, up to {depth:.2f} %", frames=frames, depth=depth
+            )
+            text = f"{text}\n{line}"
         self.facts.setText(text, left_out.sentence(self._document.model.rules))
 
 
