@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, Qt, Signal, Slot
 
-from app.work.threads import Response, end_thread, guarded, worker_thread
+from app.work.threads import Response, WorkerThread, guarded
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body
@@ -386,7 +386,7 @@ class PoseMailbox(QObject):
 
     def __init__(self, parent: QObject) -> None:
         super().__init__(parent)
-        self._worker, self._thread = PoseWorker(), worker_thread("pose")
+        self._worker, self._thread = PoseWorker(), WorkerThread("pose")
         # Emitted in that thread, and received in the window's.
         self._responded.connect(self._on_answered)
         self._waiting: PoseRequest | None = None
@@ -431,7 +431,7 @@ class PoseMailbox(QObject):
         """End the thread; see `LongWork.close`."""
         self._waiting = self._asked = None
         self.blockSignals(True)
-        return end_thread(self._thread, deadline)
+        return self._thread.end(deadline)
 
     @Slot(object)
     def _on_answered(self, answer: Response) -> None:
@@ -497,7 +497,7 @@ class FrameCache(QObject):
         self._n_bytes = 0
         self._wanted: list[tuple[Motion, int]] = []
         self._evaluator: FrameEvaluator | None = None
-        self._thread = worker_thread("frames")
+        self._thread = WorkerThread("frames")
 
     def forget(self, model: Body | None) -> None:
         """Clear the cache and start with another model."""
@@ -572,7 +572,7 @@ class FrameCache(QObject):
         with self._guard:
             self._wanted = []
         self.blockSignals(True)
-        return end_thread(self._thread, deadline)
+        return self._thread.end(deadline)
 
     def _get(self, motion: Motion, number: int) -> PoseFrame | None:
         frame = self._frames.pop(_key(motion, number), None)

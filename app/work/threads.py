@@ -7,7 +7,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,22 +53,30 @@ class Response:
     cancelled: bool = False
 
 
-def worker_thread(name: str) -> ThreadPoolExecutor:
-    """Return an executor with one thread, which runs calls one after the other."""
-    sys.setswitchinterval(_SWITCH_SECONDS)
-    return ThreadPoolExecutor(1, name)
-
-
-def end_thread(thread: ThreadPoolExecutor, deadline: float) -> bool:
-    """End a thread after the calls submitted so far; return whether it has ended in time.
+class WorkerThread(ThreadPoolExecutor):
+    """One thread, which runs calls one after the other.
 
     Parameters
     ----------
-    deadline : until when to wait, on `time.monotonic`
+    name : of the thread
     """
-    last = thread.submit(time.monotonic)
-    thread.shutdown(wait=False)
-    return bool(wait([last], max(0.001, deadline - time.monotonic())).done)
+
+    def __init__(self, name: str) -> None:
+        super().__init__(1, name)
+        sys.setswitchinterval(_SWITCH_SECONDS)
+        self._last: Future[float] | None = None
+
+    def end(self, deadline: float) -> bool:
+        """End the thread after the calls submitted so far; return whether it has ended in time.
+
+        Parameters
+        ----------
+        deadline : until when to wait, on `time.monotonic`
+        """
+        if self._last is None:
+            self._last = self.submit(time.monotonic)
+            self.shutdown(wait=False)
+        return bool(wait([self._last], max(0.001, deadline - time.monotonic())).done)
 
 
 def single_shot(parent: QObject, milliseconds: int, slot: Callable[[], object]) -> QTimer:
@@ -141,7 +149,7 @@ class LongWork(QObject):
 
     def __init__(self, parent: QObject | None = None, name: str = "long work") -> None:
         super().__init__(parent)
-        self._thread = worker_thread(name)
+        self._thread = WorkerThread(name)
         # Emitted in that thread, and received in the window's.
         self._reported.connect(self._on_reported)
         self._answered.connect(self._on_answered)
@@ -210,9 +218,9 @@ class LongWork(QObject):
             self.cancel(number)
 
     def close(self, deadline: float) -> bool:
-        """Cancel all jobs and end the thread; see `end_thread`."""
+        """Cancel all jobs and end the thread; see `WorkerThread.end`."""
         self.cancel_all()
-        return end_thread(self._thread, deadline)
+        return self._thread.end(deadline)
 
     @Slot(int, object)
     def _on_reported(self, number: int, status: object) -> None:

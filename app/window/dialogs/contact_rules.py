@@ -406,6 +406,7 @@ class ContactsDialog(Dialog):
         text = f"{pair_in_words(one[:2])}: up to {_PERCENT * one[2]:g} %"
         tip = "Ticked: contact between these two counts only beyond this depth"
         item = self._tolerated[one] = _ticked_item(self.ignored, text, _CHECKED, tip)
+        self._on_edited()
         return item
 
     @Slot(object)
