@@ -101,10 +101,14 @@ class DocumentState:
         """The motion of the working pose; None if the pose is no frame."""
         return None if self.moment is None else self.moment.motion
 
+    @property
+    def space(self) -> SpaceFactory | None:
+        """The body's space in the moment; None if it is that of every pose."""
+        return None if self.moment is None else self.moment.space
+
     def drawn(self, model: Body) -> npt.NDArray[np.float32]:
         """Return the (V, 3) vertices as drawn, in the data's unit: see `ExactCheck`."""
-        frame_space = None if self.moment is None else self.moment.space
-        check = model.exact_check(self.pose.placement, frame_space and frame_space())
+        check = model.exact_check(self.pose.placement, self.space and self.space())
         return check.drawn(check.decode(self.pose.latent)[0])
 
     def same_as(self, other: DocumentState) -> bool:

@@ -19,7 +19,6 @@ from app.work.frames import (
     PoseFrame,
     PoseMailbox,
     PoseRequest,
-    SpaceFactory,
     empty_points,
 )
 from app.work.threads import Failure, Response, single_shot
@@ -545,8 +544,8 @@ class PoseMotion(QObject):
             whole_body=self.whole_body or whole_body,
             clearance=self.clearance if self.solid else 0.0,
         )
-        pose = self._history.pose
-        start = MotionStart(pose.latent, grip, pins, options, pose.placement, self._space_factory)
+        pose, space = self._history.pose, self._history.state.space
+        start = MotionStart(pose.latent, grip, pins, options, pose.placement, space)
         self._moving = ActiveMotion(start)
         return self._moving
 
@@ -568,14 +567,9 @@ class PoseMotion(QObject):
             PoseRequest(
                 *(model, CodeTarget(pose.latent), None, self._predicts),
                 placement=pose.placement,
-                space=self._space_factory,
+                space=self._history.state.space,
             )
         )
-
-    @property
-    def _space_factory(self) -> SpaceFactory | None:
-        moment = self._history.state.moment
-        return None if moment is None else moment.space
 
     @Slot()
     def _check(self) -> None:

@@ -494,12 +494,8 @@ class Tasks(QObject):
         resolve_options = self.resolve_options(options)
         history.close_gesture()
         self.cancel_resolve()
-        moment = history.state.moment
-        frame_space = None if moment is None else moment.space
-        placement = history.pose.placement
-        job = partial(
-            resolve_pose, model, history.latent, placement, resolve_options, own=frame_space
-        )
+        pose, space = history.pose, history.state.space
+        job = partial(resolve_pose, model, pose.latent, pose.placement, resolve_options, own=space)
         self._solve_began = time.monotonic()
         self.start(Work.RESOLVE, "Resolving", job, self._on_resolved, self._on_unresolved)
         self.solve_started.emit()

@@ -97,43 +97,31 @@ class Pictures(QObject):
             renderer.close()
         self._document.tasks.write(f"Saving {path.name}", partial(_save, pixels, path))
 
-    def turntable(self, path: str | os.PathLike[str], style: VideoStyle) -> None:
-        """Start a video of one full turn round the body, replacing one that is being drawn.
+    def film(
+        self,
+        path: str | os.PathLike[str],
+        style: VideoStyle,
+        motion: Motion | None = None,
+        follows: bool = False,
+    ) -> None:
+        """Start a video, replacing one that is being drawn; emit a message once it is saved.
 
-        The document emits a message once it is saved.
+        It shows one full turn round the body, or a motion from the current camera.
 
         Parameters
         ----------
         path : a .gif or .webp file; a .png file stands for a new folder of numbered pictures with
             its stem as name
         style : size, rate and background
+        motion : with as many frames as the video; None for a full turn
+        follows : whether the camera moves along with the body of a motion
 
         Raises
         ------
         MeshFileError : the format is unknown or does not support `style`, or the folder of a PNG
             sequence exists already.
         """
-        self._film(Path(path), style, None)
-
-    def motion(
-        self,
-        path: str | os.PathLike[str],
-        style: VideoStyle,
-        motion: Motion,
-        follows: bool = False,
-    ) -> None:
-        """Start a video of a motion from the current camera; see `turntable`.
-
-        Parameters
-        ----------
-        motion : with as many frames as the video
-        follows : whether the camera moves along with the body
-        """
-        self._film(Path(path), style, motion, follows)
-
-    def _film(
-        self, path: Path, style: VideoStyle, motion: Motion | None, follows: bool = False
-    ) -> None:
+        path = Path(path)
         refusal = style.why_not_writable(path)
         if refusal is not None:
             raise refusal

@@ -44,8 +44,7 @@ class Scene:
     def __init__(self, plotter: pv.BasePlotter, model: Body, theme: Theme) -> None:
         self._renderer = plotter.renderer
         self._renderer.RemoveAllViewProps()
-        self._faces, self._mask = model.faces, model.attention_mask
-        self._up_axis, self._body_size = model.up_axis, model.body_size
+        self._faces, self._up_axis = model.faces, model.up_axis
         self.surface = Surface(model.faces, model.n_vertices)
         self.body = body_actor(self.surface.polydata)
         self.body.SetPickable(True)
@@ -63,13 +62,10 @@ class Scene:
         self.uncounted = FaceHighlight(self.surface, model.faces, UNCOUNTED_FACE, 1)
         self.crossing = FaceHighlight(self.surface, model.faces, COLLIDING_FACE, 2)
         self.selection = FaceHighlight(self.surface, model.faces, NAMED_FACE, 3)
+        self._highlights = (self.uncounted, self.crossing, self.selection)
 
-        disc = pv.Disc(
-            inner=0.0,
-            outer=_FLOOR_RADIUS * model.body_size,
-            normal=np.eye(3)[model.up_axis],
-            c_res=96,
-        )
+        up, radius = np.eye(3)[model.up_axis], _FLOOR_RADIUS * model.body_size
+        disc = pv.Disc(inner=0.0, outer=radius, normal=up, c_res=96)
         self._floor = make_actor(disc, lighting=False, culling="back")
         self._shadow = make_actor(self.surface.polydata, lighting=False)
         self._lift = 2e-3 * model.body_size
@@ -77,24 +73,16 @@ class Scene:
         self._sinks = self._is_shown = False
         for actor in (
             *(self._floor, self._shadow, self.body),
-            *(
-                self.uncounted.visible_actor,
-                self.crossing.visible_actor,
-                self.selection.visible_actor,
-                self._ghost_actor,
-            ),
-            *(
-                self.uncounted.occluded_actor,
-                self.crossing.occluded_actor,
-                self.selection.occluded_actor,
-            ),
+            *(highlight.visible_actor for highlight in self._highlights),
+            self._ghost_actor,
+            *(highlight.occluded_actor for highlight in self._highlights),
         ):
             self._renderer.AddActor(actor)
         self.outline = Outline(self._renderer)
         self._patch = Patch(model.space)
         self._patch.lie_on(self.surface.polydata)
         self._patch.paint_on(self.body)
-        self.marks = Marks(self._renderer, model.body_size, np.eye(3)[model.up_axis])
+        self.marks = Marks(self._renderer, model.body_size, up)
         self.motion = MotionMarks(self._renderer, model, theme)
         self.set_theme(theme)
 
@@ -188,7 +176,7 @@ class Scene:
         visible_faces = self._faces if hidden is None else self._faces[~hidden]
         for surface in (self.surface, self._ghost):
             surface.draw(visible_faces)
-        for highlight in (self.uncounted, self.crossing, self.selection):
+        for highlight in self._highlights:
             highlight.hidden = hidden
         if self._textured is not None:
             textured = self.is_textured
@@ -211,7 +199,7 @@ class Scene:
     def outline_domain(self, domain: int | None) -> None:
         """Outline a domain, given by its index from 0, or none."""
         faces = self._faces if self._hidden is None else self._faces[~self._hidden]
-        shape = None if domain is None else PartShape.of(self._mask, faces, domain)
+        shape = None if domain is None else PartShape.of(self._model.attention_mask, faces, domain)
         self.outline.show(shape)
 
     def show_grip(self, grip: Grip | None) -> bool:
@@ -281,7 +269,7 @@ class Scene:
         If both coincided, patches of either would show at random.
         """
         away = np.linalg.norm(self._ghost.vertices - self.surface.vertices, axis=1)
-        away /= self._body_size
+        away /= self._model.body_size
         visible = np.clip((away - _GHOST_NEAR) / (_GHOST_FAR - _GHOST_NEAR), 0.0, 1.0)
         self._ghost.colours[:, 3] = np.rint(255.0 * _GHOST_OPACITY * visible)
 

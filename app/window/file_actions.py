@@ -384,25 +384,19 @@ class FileActions(QObject):
         """Ask for a file and save; see `save`."""
         document = self._document
         document.motion.end_gesture()
-        model, poses, asked_pose = (
-            document.model,
-            document.history.file_poses,
-            document.history.pose,
-        )
-        path = self.ask_save(
-            "Save poses", self._name, {"Poses": POSES_SUFFIX}, document.history.file
-        )
+        model, history = document.model, document.history
+        poses, asked_pose = history.file_poses, history.pose
+        path = self.ask_save("Save poses", self._name, {"Poses": POSES_SUFFIX}, history.file)
         if path is None:
             return False
-        if document.history.pose is asked_pose:
+        if history.pose is asked_pose:
             document.tasks.save(path)
         else:
             # Another pose was opened while the dialog was shown.
             pose = named_after(asked_pose, path)
             text = f"Saved “{pose.name}” to {path.name}; the pose opened since is unsaved"
-            document.tasks.save_file(
-                path, as_task(save_poses, path, model, poses, pose), lambda _: text
-            )
+            job = as_task(save_poses, path, model, poses, pose)
+            document.tasks.save_file(path, job, lambda _: text)
         return True
 
     def export(self) -> None:
@@ -413,13 +407,9 @@ class FileActions(QObject):
         document = self._document
         scene = as_scene(document.model)
         if scene is not None:
-            pose, bodies = (
-                document.history.pose,
-                SceneExportDialog(self.settings, self._window, scene),
-            )
-            accepted = bodies.exec() == QDialog.DialogCode.Accepted
-            request = bodies.export_request
-            bodies.deleteLater()
+            pose = document.history.pose
+            bodies = SceneExportDialog(self.settings, self._window, scene)
+            accepted, request = run_form(bodies), bodies.export_request
             folder = self._ask_folder_of_bodies(scene, request.mesh_format) if accepted else None
             if folder is not None:
                 work = partial(scenes.export_scene_pose, folder, scene, pose, request)
@@ -427,9 +417,8 @@ class FileActions(QObject):
             return
         # Capture the model and pose now: others may be opened while the dialogs are shown.
         state = document.history.state
-        frame_space = None if state.moment is None else state.moment.space
         export = partial(
-            exporting.export, document.model, state.pose, state.outcome, own=frame_space
+            exporting.export, document.model, state.pose, state.outcome, own=state.space
         )
         form = ExportDialog(self.settings, self._window, document.model)
         accepted = run_form(form)
@@ -457,7 +446,7 @@ class FileActions(QObject):
                 path,
                 print_options(self.settings, model.rules.left_out),
                 resolve=resolve,
-                own=None if state.moment is None else state.moment.space,
+                own=state.space,
             )
             document.tasks.write(f"Exporting {path.name}", work)
 
@@ -587,7 +576,7 @@ class FileActions(QObject):
         form = video_form(self.settings, self._window)
         path = self._ask_save_after(form, "Save turntable", _VIDEOS)
         if path is not None:
-            self._viewport.pictures.turntable(path, self._video_style())
+            self._viewport.pictures.film(path, self._video_style())
 
     def video(self) -> None:
         """Ask how and where, and write a video of the motion between the in and out points."""
@@ -601,7 +590,7 @@ class FileActions(QObject):
             style = self._video_style()
             shown_motion = motion.part(range(timeline.first, timeline.last + 1)).at_rate(style.rate)
             style = replace(style, seconds=len(shown_motion) / style.rate)
-            self._viewport.pictures.motion(path, style, shown_motion, self._viewport.follows)
+            self._viewport.pictures.film(path, style, shown_motion, self._viewport.follows)
 
     def _video_style(self) -> VideoStyle:
         from app.view.offscreen import VideoStyle
@@ -749,11 +738,8 @@ class FileActions(QObject):
     def _name(self) -> str:
         """Name of the pose on the screen, with "changed" if it has been edited."""
         document = self._document
-        return (
-            f"{document.history.pose.name} changed"
-            if document.history.changed
-            else document.history.pose.name
-        )
+        name = document.history.pose.name
+        return f"{name} changed" if document.history.changed else name
 
     def ask_open(self, title: str, *kinds: str) -> Path | None:
         """Ask for a file of some kinds (see `_kinds`); None if the user cancels."""

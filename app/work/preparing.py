@@ -6,7 +6,6 @@ Loops are compiled for this computer at their first use; the core logs it, `Prep
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -115,20 +114,13 @@ class Preparing(QObject):
     def __init__(self, parent: QObject) -> None:
         super().__init__(parent)
         self._log = logging.getLogger("lcollision_core.compiled")
-        self._handler = _Handler(lambda: self.begun.emit(REASON))
-        self._log.addHandler(self._handler)
+        self._log.addFilter(self._on_record)
 
     def close(self) -> None:
         """Stop listening."""
-        self._log.removeHandler(self._handler)
+        self._log.removeFilter(self._on_record)
 
-
-class _Handler(logging.Handler):
-    """Calls a function for each record, in the record's thread."""
-
-    def __init__(self, tell: Callable[[], None]) -> None:
-        super().__init__()
-        self._tell = tell
-
-    def emit(self, _: logging.LogRecord) -> None:
-        self._tell()
+    def _on_record(self, _: logging.LogRecord) -> bool:
+        """Signal that a loop is compiled, in the thread that does; keep the record."""
+        self.begun.emit(REASON)
+        return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -119,35 +120,39 @@ def _loop(window: EditorWindow) -> None:
     playback.set_loops(not playback.loops)
 
 
-def _go(key: str, text: str, keys: str, tip: str, icon: str = "") -> None:
-    def go(window: EditorWindow) -> None:
-        timeline = _timeline(window)
-        {
-            "step_back": lambda: timeline.step(-1),
-            "step_on": lambda: timeline.step(1),
-            "go_first": lambda: timeline.go_to(timeline.first),
-            "go_last": lambda: timeline.go_to(timeline.last),
-            "colliding_before": lambda: timeline.go_to_colliding(-1),
-            "colliding_next": lambda: timeline.go_to_colliding(1),
-            "go_worst": timeline.go_to_worst,
-        }[key]()
-
-    MOTION.command(key, text, keys, tip, icon)(_with_motion(in_view(go)))
+def _go(
+    go: Callable[[Timeline], None], key: str, text: str, keys: str, tip: str, icon: str = ""
+) -> None:
+    """Add a command that moves the playhead."""
+    run = _with_motion(in_view(lambda window: go(_timeline(window))))
+    MOTION.command(key, text, keys, tip, icon)(run)
 
 
-_go("step_back", "Previous fra&me", "Left", "Go to the previous frame", "step-back")
-_go("step_on", "&Next frame", "Right", "Go to the next frame", "step-on")
-_go("go_first", "&First frame", "Home", "Go to the in point")
-_go("go_last", "L&ast frame", "End", "Go to the out point")
 _go(
+    lambda t: t.step(-1),
+    "step_back",
+    "Previous fra&me",
+    "Left",
+    "Go to the previous frame",
+    "step-back",
+)
+_go(lambda t: t.step(1), "step_on", "&Next frame", "Right", "Go to the next frame", "step-on")
+_go(lambda t: t.go_to(t.first), "go_first", "&First frame", "Home", "Go to the in point")
+_go(lambda t: t.go_to(t.last), "go_last", "L&ast frame", "End", "Go to the out point")
+_go(
+    lambda t: t.go_to_colliding(-1),
     *("colliding_before", "Previous collidin&g frame", "Shift+N"),
     *("Go to the previous colliding frame", "colliding-before"),
 )
 _go(
+    lambda t: t.go_to_colliding(1),
     *("colliding_next", "Next &colliding frame", "N"),
     *("Go to the next frame that collides", "colliding-next"),
 )
-_go("go_worst", "&Deepest overlap", "Shift+D", "Go to the frame with the deepest overlap")
+_go(
+    lambda t: t.go_to_worst(),
+    *("go_worst", "&Deepest overlap", "Shift+D", "Go to the frame with the deepest overlap"),
+)
 
 MOTION.line()
 

@@ -28,7 +28,7 @@ def video(qtbot: QtBot, window: MainWindow, path: Path, style: VideoStyle) -> Pa
         timeout=PATIENCE,
         check_params_cb=lambda words: words == f"Saved {written.name}",
     ):
-        window.viewport.pictures.turntable(path, style)
+        window.viewport.pictures.film(path, style)
     return written
 
 
@@ -75,7 +75,7 @@ def test_a_png_sequence_is_a_folder_of_numbered_pictures(
         assert (image.size, image.mode) == ((60, 40), "RGB")
     kept = (folder / names[0]).read_bytes()
     with pytest.raises(MeshFileError, match="already exists; choose a new name"):
-        window.viewport.pictures.turntable(tmp_path / "turn.png", style)
+        window.viewport.pictures.film(tmp_path / "turn.png", style)
     assert (folder / names[0]).read_bytes() == kept
 
 
@@ -84,7 +84,7 @@ def test_a_cancelled_png_sequence_leaves_nothing(
 ) -> None:
     before = set(tmp_path.iterdir())
     style = VideoStyle(seconds=8.0, width=60, height=40)
-    window.viewport.pictures.turntable(tmp_path / "turn.png", style)
+    window.viewport.pictures.film(tmp_path / "turn.png", style)
     pictures = window.viewport.pictures
     qtbot.waitUntil(lambda: pictures._video.n_drawn > 2, timeout=PATIENCE)
     with qtbot.waitSignal(window.document.message) as told:
@@ -133,7 +133,7 @@ def test_what_a_format_cannot_hold_is_refused(
     window: MainWindow, tmp_path: Path, name: str, style: VideoStyle, reason: str
 ) -> None:
     with pytest.raises(MeshFileError, match=reason):
-        window.viewport.pictures.turntable(tmp_path / name, style)
+        window.viewport.pictures.film(tmp_path / name, style)
     assert window.viewport.pictures.busy == ""
 
 

@@ -432,9 +432,7 @@ def test_a_turntable_that_is_cancelled_as_it_is_packed_leaves_no_file(
         assert cancelled.wait(120.0)
 
     monkeypatch.setattr(Image.Image, "save", save_slowly)
-    viewport.pictures.turntable(
-        tmp_path / "turn.gif", VideoStyle(seconds=0.08, width=60, height=60)
-    )
+    viewport.pictures.film(tmp_path / "turn.gif", VideoStyle(seconds=0.08, width=60, height=60))
     qtbot.waitUntil(packing.is_set, timeout=20_000)
     document.tasks.cancel_all()
     cancelled.set()
@@ -467,9 +465,7 @@ def test_a_turntable_that_fails_ends_and_tells_so_once(
     monkeypatch.setattr(owner, act, fail)
     told: list[Failure] = []
     document.failed.connect(told.append)
-    viewport.pictures.turntable(
-        tmp_path / "turn.webp", VideoStyle(seconds=0.08, width=60, height=60)
-    )
+    viewport.pictures.film(tmp_path / "turn.webp", VideoStyle(seconds=0.08, width=60, height=60))
     assert "turn.webp" in viewport.pictures.busy
     qtbot.waitUntil(lambda: bool(told) and not document.tasks.busy, timeout=20_000)
     (failure,) = told
@@ -481,7 +477,7 @@ def test_a_turntable_that_fails_ends_and_tells_so_once(
 
 def test_a_turntable_of_another_kind_is_refused(viewport: Viewport, tmp_path: Path) -> None:
     with pytest.raises(MeshFileError, match=r"turn\.avi .* \.gif, \.webp, \.png"):
-        viewport.pictures.turntable(tmp_path / "turn.avi", VideoStyle())
+        viewport.pictures.film(tmp_path / "turn.avi", VideoStyle())
 
 
 def test_the_theme_changes_what_is_behind_and_not_the_pose(
@@ -542,7 +538,7 @@ def test_a_closed_viewport_leaves_no_vtk_object_no_timer_and_no_thread(
         shown.show()
         rest(qtbot, shown)
         shown.pictures.screenshot(tmp_path / "shot.png", 50, 50, transparent=True)
-        shown.pictures.turntable(tmp_path / "cut.gif", VideoStyle(width=50, height=50))
+        shown.pictures.film(tmp_path / "cut.gif", VideoStyle(width=50, height=50))
         shown.set_camera("Back")
         n_alive = len(vtk_objects())
         dispose(shown)

@@ -50,7 +50,7 @@ def test_closing_waits_for_a_video_that_is_being_drawn(
 ) -> None:
     style, asked = VideoStyle(0.4, 80, 60, 10), []
     qtbot.waitUntil(lambda: window.document.motion.frame is not None, timeout=PATIENCE)
-    window.viewport.pictures.turntable(tmp_path / "turn.gif", style)
+    window.viewport.pictures.film(tmp_path / "turn.gif", style)
     waiting = answer(lambda box: asked.append(box.text()))
     assert window.close()
     assert not waiting.isActive()

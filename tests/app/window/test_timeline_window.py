@@ -573,7 +573,7 @@ def test_a_video_of_the_motion_has_its_frames(
     assert motion is not None
     part = motion.part(range(0, 40, 1)).at_rate(6.0)
     style = VideoStyle(len(part) / 6.0, 96, 96, 6, "plain", "#ffffff")
-    swinging.viewport.pictures.motion(tmp_path / "swing.gif", style, part)
+    swinging.viewport.pictures.film(tmp_path / "swing.gif", style, part)
     qtbot.waitUntil((tmp_path / "swing.gif").exists)
     with Image.open(tmp_path / "swing.gif") as film:
         assert film.n_frames == len(part)

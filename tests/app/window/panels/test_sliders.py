@@ -208,7 +208,7 @@ def test_escape_stops_a_turntable_that_the_status_bar_tells_of(
 ) -> None:
     cancel = window.actions_by_key["cancel"]
     assert not cancel.isEnabled()
-    window.viewport.pictures.turntable(tmp_path / "turn.gif", VideoStyle(width=60, height=60))
+    window.viewport.pictures.film(tmp_path / "turn.gif", VideoStyle(width=60, height=60))
     assert cancel.isEnabled()
     assert "Making turn.gif…" in told_as_busy(window)
     with qtbot.waitSignal(window.document.message, timeout=PATIENCE) as told:
