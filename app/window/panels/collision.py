@@ -219,7 +219,46 @@ class DomainRow(HoverRow):
             self.setToolTip(plain_tip(f"{self._name}: predicted overlap {overlap_text(energy)}"))
 
 
-class PredictionCard(Card):
+class PoseCard(Card):
+    """A card that shows each frame of the pose with its exact check once.
+
+    Parameters
+    ----------
+    document : followed
+    name : see `Card`
+    """
+
+    def __init__(self, document: PoseDocument, name: str = "card") -> None:
+        super().__init__(name)
+        self._document = document
+        self._shown: tuple[PoseFrame | None, SelfCollisions | None] | None = None
+        document.motion.frame_changed.connect(self._on_frame)
+        document.motion.exact_changed.connect(self._on_exact)
+        document.model_changed.connect(self._on_model)
+
+    @Slot()
+    def _on_exact(self) -> None:
+        if not self._document.motion.expects_verdict:
+            self._on_frame()
+
+    @Slot()
+    def _on_frame(self) -> None:
+        now = self._document.motion.frame, self._document.motion.exact
+        if self._shown is None or now[0] is not self._shown[0] or now[1] is not self._shown[1]:
+            self._shown = now
+            self._show(*now)
+
+    @Slot()
+    def _on_model(self) -> None:
+        """Show the pose of another model."""
+        self._shown = None
+        self._on_frame()
+
+    def _show(self, frame: PoseFrame | None, exact: SelfCollisions | None) -> None:
+        """Show a frame of the pose and its exact check, each None while it is unknown."""
+
+
+class PredictionCard(PoseCard):
     """The estimate, beneath the exact check; grey once the check's result is known.
 
     For a body without a predictor, only the body parts and their locks are shown.
@@ -240,10 +279,8 @@ class PredictionCard(Card):
     menu_wanted = Signal(object, object, QPoint)
 
     def __init__(self, document: PoseDocument, learn_action: QAction) -> None:
-        super().__init__()
-        self._document = document
+        super().__init__(document)
         self.rows: list[DomainRow] = []
-        self._shown: tuple[PoseFrame | None, SelfCollisions | None] | None = None
         self.learn = described(QToolButton(), learn_action.toolTip())
         self.learn.setText("Learn it…")
         self.learn.setObjectName("action")
@@ -261,9 +298,6 @@ class PredictionCard(Card):
         head.addWidget(self.percent)
         self._rows = vbox(spacing=0, margins=(0, TIGHT, 0, 0))
         self.add(vbox(head, self.meter, self._missing, self._by_rig, self._rows))
-        document.model_changed.connect(self._on_model)
-        document.motion.frame_changed.connect(self._on_frame)
-        document.motion.exact_changed.connect(self._on_exact)
         document.motion.locks_changed.connect(self._on_locks)
         if document.has_model:
             self._on_model()
@@ -293,21 +327,10 @@ class PredictionCard(Card):
         self.title.setText("Estimate" if predicts else "Body parts")
         self._missing.setVisible(not (predicts or self._document.model.can_resolve))
         self._by_rig.setVisible(model.character is not None)
-        self._shown = None
-        self._on_frame()
+        super()._on_model()
         self._on_locks()
 
-    @Slot()
-    def _on_exact(self) -> None:
-        if not self._document.motion.expects_verdict:
-            self._on_frame()
-
-    @Slot()
-    def _on_frame(self) -> None:
-        frame, exact = self._document.motion.frame, self._document.motion.exact
-        if self._shown is not None and self._shown[0] is frame and self._shown[1] is exact:
-            return
-        self._shown = frame, exact
+    def _show(self, frame: PoseFrame | None, exact: SelfCollisions | None) -> None:
         prediction = frame.prediction if frame is not None else None
         if prediction is None:
             self.meter.show_probability(None)
@@ -642,7 +665,7 @@ _HELD = "Stopped by contact"
 _NO_DEEPER = "Solid stops it from getting deeper; Resolve removes it"
 
 
-class ExactCard(Card):
+class ExactCard(PoseCard):
     """The headline of the panel: the verdict of the exact check, with pairs and overlap.
 
     While a changed pose waits for its check, the previous result stays, greyed and
@@ -666,8 +689,7 @@ class ExactCard(Card):
     points_selected = Signal(object)
 
     def __init__(self, document: PoseDocument) -> None:
-        super().__init__("exact")
-        self._document = document
+        super().__init__(document, "exact")
         self._sign = ThemedIcon(_SIGN_SIZE)
         self.verdict = labelled("", "headline", wraps=True)
         self.details = labelled("", "caption", wraps=True)
@@ -678,10 +700,7 @@ class ExactCard(Card):
         self.nearest.toggled.connect(self._on_shown)
         headline = hbox(self._sign, self.verdict, wide=self.verdict)
         self.add(title_row("Exact check", self.source), headline, self.details, self.nearest)
-        document.motion.exact_changed.connect(self._on_exact)
-        document.motion.frame_changed.connect(self._on_frame)
         document.motion.nearest_changed.connect(self._say_nearest)
-        document.model_changed.connect(self._on_model)
         self._on_model()
 
     @property
@@ -699,35 +718,20 @@ class ExactCard(Card):
             # Pairs that do not count take separate lines.
             lines = 1 if self._document.model.rules.exclude_nothing else 3
             self.details.setMinimumHeight(lines * self.details.fontMetrics().lineSpacing())
-        self._show()
+        super()._on_model()
 
-    @Slot()
-    def _on_exact(self) -> None:
-        if not self._document.motion.expects_verdict:
-            self._on_frame()
-
-    @Slot()
-    def _on_frame(self) -> None:
-        motion = self._document.motion
-        frame_shown = motion.frame, motion.exact
-        if any(new is not old for new, old in zip(frame_shown, self._shown, strict=True)):
-            self._show()
-
-    def _show(self) -> None:
+    def _show(self, frame: PoseFrame | None, exact: SelfCollisions | None) -> None:  # noqa: ARG002
         """Show the verdict of the pose, or that it is still unknown."""
-        motion = self._document.motion
-        self._shown = motion.frame, motion.exact
-        verdict = motion.exact if self._document.has_model else None
         self._kind = "waiting"
-        if verdict is not None:
-            self._kind = "colliding" if verdict.colliding else "free"
-            self._say(verdict)
-        source = _AS_READ if motion.shows_another else _SOURCE
+        if exact is not None:
+            self._kind = "colliding" if exact.colliding else "free"
+            self._say(exact)
+        source = _AS_READ if self._document.motion.shows_another else _SOURCE
         self.source.setText(_BEFORE if self.is_of_the_pose_before else source)
         self._say_nearest()
         show_verdict(self.verdict, self._kind)
         show_verdict(self, self._kind)
-        self._sign.show_icon(_SIGNS[self._kind] if verdict else self._sign.name, self._kind)
+        self._sign.show_icon(_SIGNS.get(self._kind, self._sign.name), self._kind)
 
     @Slot()
     def _say_nearest(self) -> None:
