@@ -90,7 +90,7 @@ class Tasks(QObject):
     failed : Failure
     busy_changed : str, the label of the long work, or "" if there is none
     progressed : int and int, steps of the long work done, and their total
-    solve_started, solve_progressed(object), solve_finished(object) : around a Resolve; the last
+    solve_started, solve_progressed(int, int), solve_finished(object) : around a Resolve; the last
         carries its ResolveResult, or None if it was cancelled or failed
     motion_progressed : int and int, frames that a Resolve of a motion has done, and their total
     opened : Path, the file of poses or of a model that is now open
@@ -109,7 +109,7 @@ class Tasks(QObject):
     busy_changed = Signal(str)
     progressed = Signal(int, int)
     solve_started = Signal()
-    solve_progressed = Signal(object)
+    solve_progressed = Signal(int, int)
     solve_finished = Signal(object)
     motion_progressed = Signal(int, int)
     opened = Signal(object)
@@ -524,13 +524,13 @@ class Tasks(QObject):
 
     # The results of the workers.
 
-    @Slot(int, object)
-    def _on_progressed(self, number: int, status: tuple[int, int]) -> None:
-        self.progressed.emit(*status)
+    @Slot(int, int, int)
+    def _on_progressed(self, number: int, done: int, total: int) -> None:
+        self.progressed.emit(done, total)
         if number == self._numbers.get(Work.RESOLVE):
-            self.solve_progressed.emit(status)
+            self.solve_progressed.emit(done, total)
         elif number == self._numbers.get(Work.RESOLVE_MOTION):
-            self.motion_progressed.emit(*status)
+            self.motion_progressed.emit(done, total)
 
     def _on_model(self, opened: OpenedModel) -> None:
         self.model_opened.emit(opened)

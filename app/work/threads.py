@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from PySide6.QtCore import QObject, QTimer, Signal, Slot
@@ -135,16 +136,16 @@ class LongWork(QObject):
     -------
     busy_changed : str, the label of the oldest unfinished job, "" if there is none
     idle : the last job has ended
-    progressed : int and object, the job's number and its progress
+    progressed : three ints, the job's number, its steps done and their total
     failed : Failure of a job that was started without `failed`
     """
 
     busy_changed = Signal(str)
     idle = Signal()
-    progressed = Signal(int, object)
+    progressed = Signal(int, int, int)
     failed = Signal(object)
 
-    _reported = Signal(int, object)
+    _reported = Signal(int, int, int)
     _answered = Signal(int, object)
 
     def __init__(self, parent: QObject | None = None, name: str = "long work") -> None:
@@ -195,13 +196,11 @@ class LongWork(QObject):
 
     def _run(self, number: int, label: str, work: Task, job: Job) -> None:
         """Run a job in the other thread; its errors become its response."""
-
-        def report(*status: Any) -> None:
-            self._reported.emit(number, status[0] if len(status) == 1 else status)
+        report = at_most_every(_PROGRESS_SECONDS, partial(self._reported.emit, number))
 
         def run() -> object:
             job.check()
-            return work(job.part(at_most_every(_PROGRESS_SECONDS, report)))
+            return work(job.part(report))
 
         self._answered.emit(number, guarded(label, run))
 
@@ -222,10 +221,10 @@ class LongWork(QObject):
         self.cancel_all()
         return self._thread.end(deadline)
 
-    @Slot(int, object)
-    def _on_reported(self, number: int, status: object) -> None:
+    @Slot(int, int, int)
+    def _on_reported(self, number: int, done: int, total: int) -> None:
         if number in self._jobs:
-            self.progressed.emit(number, status)
+            self.progressed.emit(number, done, total)
 
     @Slot(int, object)
     def _on_answered(self, number: int, answer: Response) -> None:

@@ -505,12 +505,11 @@ class ResolveCard(Card):
         if had_focus:
             button.setFocus()
 
-    @Slot(object)
-    def _on_progressed(self, status: object) -> None:
-        if isinstance(status, tuple) and len(status) == 2 and status[1] > 0 and status[0] > 0:
-            done, total = status
-            self.bar.setRange(0, int(total))
-            self.bar.setValue(int(done))
+    @Slot(int, int)
+    def _on_progressed(self, done: int, total: int) -> None:
+        if done > 0:
+            self.bar.setRange(0, total)
+            self.bar.setValue(done)
 
     @Slot(object)
     def _on_finished(self, result: object) -> None:  # noqa: ARG002

@@ -221,7 +221,7 @@ def test_progress_of_a_solve_is_told(
     _, ended = endless_resolve(monkeypatch)
     with qtbot.waitSignal(document.tasks.solve_progressed) as told:
         document.tasks.resolve()
-    assert told.args == [(1, 2)]
+    assert told.args == [1, 2]
     document.tasks.cancel_resolve()
     qtbot.waitUntil(ended.is_set)
 
