@@ -16,13 +16,7 @@ from lcollision_core.tasks.words import counted
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from lcollision_core.bodies import (
-        Body,
-        LibraryChange,
-        LibraryWrite,
-        NamedPose,
-        PoseLibrary,
-    )
+    from lcollision_core.bodies import Body, LibraryChange, LibraryWrite, NamedPose, PoseLibrary
     from lcollision_core.jobs import Job
 
 
