@@ -277,6 +277,7 @@ def test_resolve_frees_the_motion_in_one_step_and_keeps_the_rest_to_the_bit(
     assert now(timeline) is before
 
 
+@pytest.mark.slow
 def test_a_resolve_right_after_an_edit_is_not_spoilt_by_its_easing(
     qtbot: QtBot, document: PoseDocument, timeline: Timeline
 ) -> None:
