@@ -1,4 +1,7 @@
-"""Contact rules and clearances applied to one mesh: what the search looks up."""
+"""Contact rules and clearances applied to one mesh: what the search looks up.
+
+A rule is a field of `meshes.contact_rules.ContactRules`; `kernels.rule_of` decides which applies.
+"""
 
 from __future__ import annotations
 
