@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from lcollision_core.bodies import rig_kernels
-from lcollision_core.meshes.topology import FloatArray, IntArray
+from lcollision_core.bodies.rig_kernels import Influences, JointFrames
+from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.on_gpu import (
     THREADS,
     Buffers,
@@ -30,7 +30,7 @@ def skin_poses(linear, translations, first, joints, weights, points, body_size, 
     Parameters
     ----------
     linear, translations : (B, J, 3, 3) and (B, J, 3)
-    first to points : as in `rig_kernels.skin`
+    first to points : `rig_kernels.Influences`
     """
     start = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
     for pose in range(cuda.blockIdx.y, vertices.shape[0], cuda.gridDim.y):
@@ -49,8 +49,7 @@ class GpuSkin:
     Parameters
     ----------
     turns_of_poses : maps (B, D) codes to the turns and shifts of `rig_kernels`
-    joint_frames : parents to own_inverses of `rig_kernels.joint_motions`
-    influences : first, joints, weights and points of `rig_kernels.skin`
+    joint_frames, influences : see `rig_kernels`
     body_size : in the data's unit
     """
 
@@ -59,8 +58,8 @@ class GpuSkin:
     def __init__(
         self,
         turns_of_poses: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
-        joint_frames: tuple[Any, ...],
-        influences: tuple[IntArray, IntArray, FloatArray, FloatArray],
+        joint_frames: JointFrames,
+        influences: Influences,
         body_size: float,
     ) -> None:
         self._turns_of_poses, self._joint_frames = turns_of_poses, joint_frames
@@ -72,8 +71,7 @@ class GpuSkin:
         """Decode (B, D) codes to (B, V, 3) float32 GPU vertices, valid until the next call."""
         turns, shifts = self._turns_of_poses(codes)
         linear, translations = np.empty((*turns.shape, 3)), np.empty(turns.shape)
-        rest: tuple[Any, ...] = (*self._joint_frames, linear, translations)
-        rig_kernels.move_joints(turns, shifts, *rest)
+        rig_kernels.move_joints(turns, shifts, self._joint_frames, linear, translations)
         moved = map(cuda.to_device, (linear, translations))
         vertices = self._buffers.take("vertices", (len(codes), self._n_vertices, 3), np.float32)
         skin_poses[(blocks_for(self._n_vertices), rows_for(len(codes))), THREADS](

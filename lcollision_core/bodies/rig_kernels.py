@@ -16,12 +16,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.compiled import compiled, compiled_part, compiled_sums
 from lcollision_core.meshes.topology import FloatArray, IntArray
+
+_F: TypeAlias = FloatArray
+JointFrames: TypeAlias = tuple[npt.NDArray[np.int64], _F, _F, _F, _F, _F, _F]
+"""The J joints at rest: their parents, -1 for joint 0 only; X_b, axes as columns, and X_b^-1; o_b
+and p_b; Y_b, and its inverse or pseudo-inverse."""
+
+Influences: TypeAlias = tuple[IntArray, IntArray, FloatArray, FloatArray]
+"""The (V + 1,) start of each vertex's influences; their (M,) joints and weights; (M, 3) points."""
+
+Motions: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""(J, 3, 3) and (J, 3) linear maps and translations of D_b; q_b, the posed joint positions; and
+(J, 3, 3, 3) K_b,i: a point p carried by D_b moves by K_b,i (p - q_b) per unit of entry i of w_b."""
 
 _SERIES = 0.02
 """Radians below which the coefficients of the exponential's derivative are series."""
@@ -86,35 +99,15 @@ def rotation_slopes(turns: FloatArray, axes: FloatArray, own: FloatArray) -> Flo
 
 
 @compiled
-def joint_motions(
-    turns: FloatArray,
-    shift: FloatArray,
-    parents: npt.NDArray[np.int64],
-    axes: FloatArray,
-    inverses: FloatArray,
-    origins: FloatArray,
-    places: FloatArray,
-    own: FloatArray,
-    own_inverses: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def joint_motions(turns: FloatArray, shift: FloatArray, frames: JointFrames) -> Motions:
     """Return each joint's motion D_b from the rest pose, and its derivatives by the turns.
 
     Parameters
     ----------
     turns : (J, 3) rotation vectors w_b in the joints' axes
     shift : (3,) of joint 0
-    parents : (J,), -1 for joint 0 only
-    axes, inverses : (J, 3, 3) X_b, axes as columns, and X_b^-1
-    origins, places : (J, 3) o_b and p_b
-    own, own_inverses : (J, 3, 3) Y_b, and its inverse or pseudo-inverse
-
-    Returns
-    -------
-    linear, translations : (J, 3, 3) and (J, 3) of D_b
-    pivots : (J, 3) q_b, the posed joint positions
-    generators : (J, 3, 3, 3) K_b,i: a point p carried by D_b moves by K_b,i (p - q_b) per unit
-        of entry i of w_b
     """
+    parents, axes, inverses, origins, places, own, own_inverses = frames
     n_joints = len(turns)
     linear, generators = np.empty((n_joints, 3, 3)), np.empty((n_joints, 3, 3, 3))
     inverted = np.empty((n_joints, 3, 3))
@@ -175,22 +168,10 @@ def skinned_vertex(
 
 @compiled
 def skin(
-    linear: FloatArray,
-    translations: FloatArray,
-    first: IntArray,
-    joints: IntArray,
-    weights: FloatArray,
-    points: FloatArray,
-    vertices: FloatArray,
+    linear: FloatArray, translations: FloatArray, influences: Influences, vertices: FloatArray
 ) -> None:
-    """Write the (V, 3) vertices of one pose.
-
-    Parameters
-    ----------
-    linear, translations : (J, 3, 3) and (J, 3), the joints' motions from the rest pose
-    first : (V + 1,) start of each vertex's influences
-    joints, weights, points : (M,), (M,) and (M, 3), the influences
-    """
+    """Write the (V, 3) vertices of one pose, given `Motions` of the joints."""
+    first, joints, weights, points = influences
     for vertex in range(len(first) - 1):
         x, y, z = skinned_vertex(linear, translations, first, joints, weights, points, vertex)
         vertices[vertex, 0] = x
@@ -202,24 +183,13 @@ def skin(
 def move_joints(
     turns: FloatArray,
     shifts: FloatArray,
-    parents: npt.NDArray[np.int64],
-    axes: FloatArray,
-    inverses: FloatArray,
-    origins: FloatArray,
-    places: FloatArray,
-    own: FloatArray,
-    own_inverses: FloatArray,
+    frames: JointFrames,
     linear: FloatArray,
     translations: FloatArray,
 ) -> None:
-    """Write the joints' motions, (B, J, 3, 3) and (B, J, 3), for a block of poses.
-
-    For other parameters see `skin_poses`.
-    """
+    """Write the joints' motions, (B, J, 3, 3) and (B, J, 3), for turns and shifts of B poses."""
     for pose in range(len(turns)):
-        turned, moved, _, _ = joint_motions(
-            turns[pose], shifts[pose], parents, axes, inverses, origins, places, own, own_inverses
-        )
+        turned, moved, _, _ = joint_motions(turns[pose], shifts[pose], frames)
         for joint in range(len(turned)):
             _put(turned[joint], linear[pose, joint])
             for row in range(3):
@@ -230,61 +200,24 @@ def move_joints(
 def skin_poses(
     turns: FloatArray,
     shifts: FloatArray,
-    parents: npt.NDArray[np.int64],
-    axes: FloatArray,
-    inverses: FloatArray,
-    origins: FloatArray,
-    places: FloatArray,
-    own: FloatArray,
-    own_inverses: FloatArray,
-    first: IntArray,
-    joints: IntArray,
-    weights: FloatArray,
-    points: FloatArray,
+    frames: JointFrames,
+    influences: Influences,
     vertices: FloatArray,
 ) -> None:
-    """Write the (B, V, 3) vertices of a block of poses.
-
-    Parameters
-    ----------
-    turns, shifts : (B, J, 3) and (B, 3)
-    parents to own_inverses : see `joint_motions`
-    first to points : see `skin`
-    """
+    """Write the (B, V, 3) vertices of a block of poses, for (B, J, 3) turns and (B, 3) shifts."""
     for pose in range(len(turns)):
-        linear, translations, _, _ = joint_motions(
-            turns[pose],
-            shifts[pose],
-            parents,
-            axes,
-            inverses,
-            origins,
-            places,
-            own,
-            own_inverses,
-        )
-        skin(linear, translations, first, joints, weights, points, vertices[pose])
+        linear, translations, _, _ = joint_motions(turns[pose], shifts[pose], frames)
+        skin(linear, translations, influences, vertices[pose])
 
 
 @compiled
 def pull_back_moments(
     by_vertices: FloatArray,
-    first: IntArray,
-    joints: IntArray,
-    weights: FloatArray,
-    points: FloatArray,
+    influences: Influences,
     parents: npt.NDArray[np.int64],
-    linear: FloatArray,
-    translations: FloatArray,
-    pivots: FloatArray,
-    generators: FloatArray,
+    motions: Motions,
 ) -> tuple[FloatArray, FloatArray]:
-    """Turn derivatives by vertices into those by the joints' turns and the shift.
-
-    Parameters
-    ----------
-    by_vertices : (n, V, 3)
-    others : see `skin_poses` and `joint_motions`
+    """Turn (n, V, 3) derivatives by vertices into those by the joints' turns and the shift.
 
     Returns
     -------
@@ -296,6 +229,8 @@ def pull_back_moments(
     the origin A = sum w g p^T and the forces F = sum w g over b and its descendants give the
     derivative by entry i of w_b: the sum of the entries of K_b,i * (A - F q_b^T).
     """
+    first, joints, weights, points = influences
+    linear, translations, pivots, generators = motions
     n_rows, n_joints = len(by_vertices), len(parents)
     by_turns, by_shift = np.zeros((n_rows, n_joints, 3)), np.empty((n_rows, 3))
     for row in range(n_rows):
@@ -333,23 +268,13 @@ def pull_back_moments(
 @compiled
 def tangents(
     chosen: npt.NDArray[np.int64],
-    first: IntArray,
-    joints: IntArray,
-    weights: FloatArray,
-    points: FloatArray,
+    influences: Influences,
     parents: npt.NDArray[np.int64],
-    linear: FloatArray,
-    translations: FloatArray,
-    pivots: FloatArray,
-    generators: FloatArray,
+    motions: Motions,
 ) -> FloatArray:
-    """Return the derivatives of (n,) chosen vertices by the joints' turns: (J, 3, n, 3).
-
-    Parameters
-    ----------
-    chosen : indices from 0
-    others : see `skin_poses` and `joint_motions`
-    """
+    """Return the derivatives of (n,) chosen vertices by the joints' turns: (J, 3, n, 3)."""
+    first, joints, weights, points = influences
+    linear, translations, pivots, generators = motions
     moved = np.zeros((len(parents), 3, len(chosen), 3))
     for place in range(len(chosen)):
         vertex = chosen[place]
@@ -390,9 +315,7 @@ class PoseShapes:
         self,
         slopes: FloatArray,
         chosen: npt.NDArray[np.int64],
-        first: IntArray,
-        joints: IntArray,
-        weights: FloatArray,
+        influences: Influences,
         linear: FloatArray,
     ) -> FloatArray:
         """Return derivatives of chosen vertices, via their points, by the turns: (B, 3, n, 3).
@@ -401,10 +324,10 @@ class PoseShapes:
         ----------
         slopes : (B, 3, 3, 3) derivatives of the rotations by the turns
         chosen : (n,) indices from 0
-        first, joints, weights : of the chosen vertices, see `rig_kernels.skin_poses`
+        influences : of the chosen vertices
         linear : of the bones' motions
         """
-        blended = _blended(first, joints, weights, linear)
+        blended = _blended(influences, linear)
         return _moved(self.directions, slopes.reshape(len(slopes), 3, 9), chosen, blended)
 
     def pull_back(
@@ -412,13 +335,11 @@ class PoseShapes:
         slopes: FloatArray,
         by_vertices: FloatArray,
         chosen: npt.NDArray[np.int64],
-        first: IntArray,
-        joints: IntArray,
-        weights: FloatArray,
+        influences: Influences,
         linear: FloatArray,
     ) -> FloatArray:
         """Turn derivatives by the chosen vertices, (m, n, 3), into those by turns, (m, B, 3)."""
-        blended = _blended(first, joints, weights, linear)
+        blended = _blended(influences, linear)
         by_points = np.einsum("mnx,nxa->mna", by_vertices, blended)
         flat = self.directions.reshape(len(self.directions), 3, -1)
         by_entries = _summed(flat, by_points, chosen)
@@ -443,10 +364,9 @@ def _offsets(directions: _Shapes, entries: FloatArray, chosen: npt.NDArray[np.in
 
 
 @compiled
-def _blended(
-    first: IntArray, joints: IntArray, weights: FloatArray, linear: FloatArray
-) -> FloatArray:
+def _blended(influences: Influences, linear: FloatArray) -> FloatArray:
     """Return the weighted mean of each vertex's linear maps: (n, 3, 3)."""
+    first, joints, weights, _ = influences
     blended = np.zeros((len(first) - 1, 3, 3))
     for place in range(len(blended)):
         for influence in range(first[place], first[place + 1]):

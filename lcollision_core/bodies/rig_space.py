@@ -7,7 +7,6 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +14,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies import rig_kernels
-from lcollision_core.bodies.rig_kernels import PoseShapes
+from lcollision_core.bodies.rig_kernels import Influences, JointFrames, Motions, PoseShapes
 from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, axes_of, joint_limits, rig_of
 from lcollision_core.errors import ShapeError
 from lcollision_core.files.character import Character, Rig
@@ -25,8 +24,6 @@ from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.limbs import LEAST_LIMB, Limbs
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, length_graph
 from lcollision_core.posing.pose_space import DisplacementMetrics, PosesOnGpu
-
-_Influences = tuple[IntArray, IntArray, FloatArray, FloatArray]
 
 ROOT_CODES = 6
 """Codes of the whole body: its shift along left, up and front, and its turn about them."""
@@ -510,12 +507,12 @@ class RigPoseSpace:
             self._shaped_points = self._points, numbers.tobytes(), points
         return points
 
-    def _motions(self, codes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def _motions(self, codes: FloatArray) -> Motions:
         turns, shift = self._turns(codes)
-        return rig_kernels.joint_motions(turns, shift, *self._joint_frames)
+        return rig_kernels.joint_motions(turns, shift, self._joint_frames)
 
     @property
-    def _joint_frames(self) -> tuple[Any, ...]:
+    def _joint_frames(self) -> JointFrames:
         return (
             self._parents,
             self._bone_axes,
@@ -527,7 +524,7 @@ class RigPoseSpace:
         )
 
     @property
-    def _influences(self) -> _Influences:
+    def _influences(self) -> Influences:
         return self._first, self._joints, self._weights, self._points
 
     @cached_property
@@ -539,8 +536,8 @@ class RigPoseSpace:
         return rig_kernels.rotation_slopes(turns, self._bone_axes, self._own)
 
     def _shaped(
-        self, codes: FloatArray, influences: _Influences, chosen: npt.NDArray[np.integer]
-    ) -> _Influences:
+        self, codes: FloatArray, influences: Influences, chosen: npt.NDArray[np.integer]
+    ) -> Influences:
         """Return influences of chosen vertices including the pose blend shapes."""
         if self._shapes is None:
             return influences
@@ -571,8 +568,8 @@ class RigPoseSpace:
         for start, end in pairwise([*starts, len(poses)]):
             influences = self._influences_of(chosen, poses[start])
             block, shaped = slice(start, end), self._shaped(poses[start], influences, chosen)
-            skin: tuple[Any, ...] = (*self._joint_frames, *shaped, vertices[block])
-            rig_kernels.skin_poses(turns[block], shifts[block], *skin)
+            at_rest, out = self._joint_frames, vertices[block]
+            rig_kernels.skin_poses(turns[block], shifts[block], at_rest, shaped, out)
         return vertices
 
     def gpu_decoder(self, body_size: float) -> PosesOnGpu | None:
@@ -588,7 +585,7 @@ class RigPoseSpace:
         turns = np.array([turns for turns, _ in both]).reshape(len(poses), len(self._bones), 3)
         return turns, np.array([shift for _, shift in both]).reshape(len(poses), 3)
 
-    def _influences_of(self, chosen: npt.NDArray[np.integer], codes: FloatArray) -> _Influences:
+    def _influences_of(self, chosen: npt.NDArray[np.integer], codes: FloatArray) -> Influences:
         points = self._points_of(codes)
         if chosen is self._everyone:
             return self._first, self._joints, self._weights, points
@@ -626,7 +623,7 @@ class RigPoseSpace:
         codes: FloatArray,
         by_vertices: FloatArray,
         chosen: npt.NDArray[np.int64],
-        influences: _Influences | None = None,
+        influences: Influences | None = None,
         *,
         by_shapes: bool = False,
     ) -> FloatArray:
@@ -640,11 +637,11 @@ class RigPoseSpace:
             influences = self._influences_of(chosen, codes)
         influences = self._shaped(codes, influences, chosen)
         by_turns, by_shift = rig_kernels.pull_back_moments(
-            given, *influences, self._parents, *motions
+            given, influences, self._parents, motions
         )
         if self._shapes is not None:
             slopes = self._slopes(codes)
-            by_turns += self._shapes.pull_back(slopes, given, chosen, *influences[:3], motions[0])
+            by_turns += self._shapes.pull_back(slopes, given, chosen, influences, motions[0])
         by_numbers = np.concatenate(
             [by_shift @ self.body_axes, by_turns.reshape(len(by_shift), 3 * len(self._bones))],
             axis=1,
@@ -658,10 +655,10 @@ class RigPoseSpace:
         """Return the derivatives of (n,) vertices of a (D,) pose by its codes: (D, n, 3)."""
         motions = self._motions(codes)
         influences = self._shaped(codes, self._influences_of(chosen, codes), chosen)
-        turned = rig_kernels.tangents(np.arange(len(chosen)), *influences, self._parents, *motions)
+        turned = rig_kernels.tangents(np.arange(len(chosen)), influences, self._parents, motions)
         if self._shapes is not None:
             slopes = self._slopes(codes)
-            turned += self._shapes.tangents(slopes, chosen, *influences[:3], motions[0])
+            turned += self._shapes.tangents(slopes, chosen, influences, motions[0])
         shifted = np.broadcast_to(self.body_axes.T[:, None], (3, len(chosen), 3))
         moved = np.concatenate([shifted, turned.reshape(-1, len(chosen), 3)])
         return np.concatenate([moved[self._place], self._moved_by_shapes(chosen, motions[0])])
@@ -957,7 +954,7 @@ class RigPoseSpace:
             points = points + np.repeat(offsets, np.diff(first), axis=0)
         vertices = np.empty((len(first) - 1, 3))
         influences = (first, joints, weights, points)
-        rig_kernels.skin(linear, moved[:, :3, 3] / self.body_size, *influences, vertices)
+        rig_kernels.skin(linear, moved[:, :3, 3] / self.body_size, influences, vertices)
         return vertices
 
     def _checked(self, transforms: npt.ArrayLike) -> FloatArray:
