@@ -685,6 +685,8 @@ def skeleton_notes(body: Body, path: Path) -> tuple[str, ...]:
     rested = Retargeting.of(motion, rig_space_of(body, path), path).motion
     if rested.turns_y_up:
         return (*notes, f"{path.name} stands along y at rest and along z in its frames: z is up")
+    if rested.up.min() < 0.0:
+        return (*notes, f"{path.name} stands along -y: y is down")
     if rested.frame is None:
         return notes
     at = f"frame {rested.frame} (from 0)"

@@ -78,7 +78,7 @@ class ReposedMotion:
     ----------
     stored : the skeleton as in its file
     rest_turns : (J, 3, 3) world rotations of its joints in the new rest pose
-    up : (3,) unit vector, an axis
+    up : (3,) unit vector, an axis; -y in files with the axes of pictures
     front : (3,) unit vector, an axis; None to take it from the file's own rest pose
     frame : the frame that the rest pose was taken from; None for the file's own
     """
@@ -231,6 +231,8 @@ def with_standing_rest(motion: SkeletonMotion) -> ReposedMotion:
     mean = marks.trunk(places).mean(axis=0)
     up = np.eye(3)[2 if mean[2] > max(mean[1], _UPRIGHT) else 1]
     own_way = marks.trunk(rest)
+    if stands and own_way[1] < -_UPRIGHT and mean[1] < -_UPRIGHT:
+        return ReposedMotion(motion, own_turns, -up)
     is_level = mean @ up < _UPRIGHT
     if stands and own_way[1] > _UPRIGHT and _stands_on_z(marks, rest, places):
         return ReposedMotion(motion, np.broadcast_to(_TO_Z_UP, own_turns.shape), up)

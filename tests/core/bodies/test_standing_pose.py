@@ -104,9 +104,15 @@ def limbs_of(stored: Stored) -> FloatArray:
     return units / np.linalg.norm(units, axis=2, keepdims=True)
 
 
+Y_DOWN = np.diag([1.0, -1.0, -1.0])
+"""As in pictures, from which motions are estimated."""
+
+
 def axes_of(kind: str, rng: np.random.Generator) -> FloatArray:
     if kind in ("standing", "z up in its frames"):
         return np.broadcast_to(np.eye(3), (len(NAMES), 3, 3))
+    if kind == "y down":
+        return np.broadcast_to(Y_DOWN, (len(NAMES), 3, 3))
     if kind == "lying":
         lying = Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
         return np.broadcast_to(lying, (len(NAMES), 3, 3))
@@ -115,7 +121,7 @@ def axes_of(kind: str, rng: np.random.Generator) -> FloatArray:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
-    "kind", ["any", "lying", "standing", "without names", "z up in its frames"]
+    "kind", ["any", "lying", "standing", "without names", "y down", "z up in its frames"]
 )
 def test_limbs_point_as_they_are_shown_whatever_the_rest_pose(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -128,8 +134,11 @@ def test_limbs_point_as_they_are_shown_whatever_the_rest_pose(kind: str, seed: i
     if kind == "z up in its frames":
         z_up = Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
         stored = replace(stored, world=z_up @ stored.world, roots=stored.roots @ z_up.T)
+    if kind == "y down":
+        stored = replace(stored, world=Y_DOWN @ stored.world, roots=stored.roots @ Y_DOWN.T)
     retargeting = Retargeting.of(stored, body.space, Path("capture.bvh"))
-    assert (retargeting.motion.frame is None) == (kind in ("standing", "z up in its frames"))
+    as_stored = ("standing", "y down", "z up in its frames")
+    assert (retargeting.motion.frame is None) == (kind in as_stored)
     transforms = retargeting.transforms()
     places = transforms[..., :3, 3] @ TO_Y_UP.T
     ours = list(body.space.rig.joint_names)
