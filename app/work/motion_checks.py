@@ -116,6 +116,7 @@ def check_motion(
     job: Job,
 ) -> None:
     """Check the unchecked frames of a motion, and write the results into `checks`."""
+    from lcollision_core.jobs import available_cores, for_blocks
     from lcollision_core.meshes.contact_rules import ExcludedPairs
 
     check, n = model.exact_check(), len(motion)
@@ -127,24 +128,30 @@ def check_motion(
             rows = slice(start, start + 256)
             if np.isnan(checks.estimate[rows]).any():
                 checks.estimate[rows] = model.predict(motion.codes[rows]).collision_probability
-    for number in coarse_to_fine(n):
-        job.check()
-        if np.isnan(checks.deepest[number]):
-            collisions = check.find(motion.vertices(number, check), counted_only=number % step != 0)
-            depths = collisions.penetration_depth
-            for side in (0, 1) if collisions.colliding else ():
-                np.maximum.at(checks.parts[number], owners[collisions.pairs[:, side]], depths)
-            checks.excluded[number] = tuple(collisions.excluded.to_json().values())
-            checks.excluded_deepest[number] = collisions.excluded_depth.max(initial=0.0)
-            # Written last: from here on the frame counts as checked.
-            checks.deepest[number] = float(depths.max()) if collisions.colliding else 0.0
-            job.report(checks.n_checked, n)
-    for number in range(n - 1):
-        if checks.checked_between[number]:
-            continue
-        job.check()
+    unchecked = [number for number in coarse_to_fine(n) if np.isnan(checks.deepest[number])]
+
+    def check_frame(at: int, _: int) -> None:
+        number = unchecked[at]
+        collisions = check.find(motion.vertices(number, check), counted_only=number % step != 0)
+        depths = collisions.penetration_depth
+        for side in (0, 1) if collisions.colliding else ():
+            np.maximum.at(checks.parts[number], owners[collisions.pairs[:, side]], depths)
+        checks.excluded[number] = tuple(collisions.excluded.to_json().values())
+        checks.excluded_deepest[number] = collisions.excluded_depth.max(initial=0.0)
+        # Written last: from here on the frame counts as checked.
+        checks.deepest[number] = float(depths.max()) if collisions.colliding else 0.0
+
+    between = np.flatnonzero(~checks.checked_between[: n - 1]).tolist()
+
+    def check_after(at: int, _: int) -> None:
+        number = between[at]
         if checks.deepest[number] == checks.deepest[number + 1] == 0.0:
             collisions = check.find(motion.vertices(number, check, 0.5))
             checks.between[number] = collisions.colliding
         checks.checked_between[number] = True
-        job.report(n, n)
+
+    # One core is left to the window.
+    n_threads = max(1, available_cores() - 1)
+    checking = job.part(lambda *_: job.report(checks.n_checked, n))
+    for_blocks(check_frame, len(unchecked), 1, n_threads, checking)
+    for_blocks(check_after, len(between), 1, n_threads, checking)
