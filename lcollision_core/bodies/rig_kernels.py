@@ -54,8 +54,8 @@ def _put(values: FloatArray, out: FloatArray) -> None:
 
 
 @compiled_part
-def _exponential(turn: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the exponential of a (3,) rotation vector and its left Jacobian, both (3, 3)."""
+def _coefficients(turn: FloatArray) -> tuple[float, float, float]:
+    """Return the factors of [w]x and [w]x^2 in the exponential, and of [w]x^2 in its Jacobian."""
     squared = turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2
     angle = math.sqrt(squared)
     if angle < _SERIES:
@@ -66,9 +66,39 @@ def _exponential(turn: FloatArray) -> tuple[FloatArray, FloatArray]:
         sine = math.sin(angle) / angle
         versine = 2.0 * math.sin(0.5 * angle) ** 2 / squared
         rest = (angle - math.sin(angle)) / (angle * squared)
+    return sine, versine, rest
+
+
+@compiled_part
+def _exponential(turn: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the exponential of a (3,) rotation vector and its left Jacobian, both (3, 3)."""
+    sine, versine, rest = _coefficients(turn)
     across = _cross_matrix(turn)
     twice = across @ across
     return np.eye(3) + sine * across + versine * twice, np.eye(3) + versine * across + rest * twice
+
+
+@compiled_part
+def _put_rotation(turn: FloatArray, out: FloatArray) -> None:
+    """Write the exponential of a (3,) rotation vector to a (3, 3) array."""
+    sine, versine, _ = _coefficients(turn)
+    x, y, z = turn
+    out[0, 0], out[0, 1] = 1.0 - versine * (y * y + z * z), versine * x * y - sine * z
+    out[0, 2], out[1, 0] = versine * x * z + sine * y, versine * x * y + sine * z
+    out[1, 1], out[1, 2] = 1.0 - versine * (x * x + z * z), versine * y * z - sine * x
+    out[2, 0], out[2, 1] = versine * x * z - sine * y, versine * y * z + sine * x
+    out[2, 2] = 1.0 - versine * (x * x + y * y)
+
+
+@compiled_part
+def _put_product(one: FloatArray, other: FloatArray, out: FloatArray) -> None:
+    for row in range(3):
+        for column in range(3):
+            out[row, column] = (
+                one[row, 0] * other[0, column]
+                + one[row, 1] * other[1, column]
+                + one[row, 2] * other[2, column]
+            )
 
 
 @compiled
@@ -187,13 +217,33 @@ def move_joints(
     linear: FloatArray,
     translations: FloatArray,
 ) -> None:
-    """Write the joints' motions, (B, J, 3, 3) and (B, J, 3), for turns and shifts of B poses."""
+    """Write the joints' motions, (B, J, 3, 3) and (B, J, 3), for turns and shifts of B poses.
+
+    They are those of `joint_motions`, without derivatives.
+    """
+    parents, axes, _, origins, places, own, _ = frames
+    before, turn, turned = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for pose in range(len(turns)):
-        turned, moved, _, _ = joint_motions(turns[pose], shifts[pose], frames)
-        for joint in range(len(turned)):
-            _put(turned[joint], linear[pose, joint])
+        moved, shift = linear[pose], translations[pose]
+        for joint in range(turns.shape[1]):
+            parent = parents[joint]
+            _put_rotation(turns[pose, joint], turn)
+            if parent < 0:
+                _put_product(axes[joint], turn, turned)
+            else:
+                _put_product(moved[parent], axes[joint], before)
+                _put_product(before, turn, turned)
+            _put_product(turned, own[joint], moved[joint])
             for row in range(3):
-                translations[pose, joint, row] = moved[joint, row]
+                if parent < 0:
+                    at = places[joint, row] + shifts[pose, row]
+                else:
+                    at = _posed(moved[parent], shift[parent], places[joint], row)
+                shift[joint, row] = at - (
+                    moved[joint, row, 0] * origins[joint, 0]
+                    + moved[joint, row, 1] * origins[joint, 1]
+                    + moved[joint, row, 2] * origins[joint, 2]
+                )
 
 
 @compiled
@@ -205,9 +255,11 @@ def skin_poses(
     vertices: FloatArray,
 ) -> None:
     """Write the (B, V, 3) vertices of a block of poses, for (B, J, 3) turns and (B, 3) shifts."""
-    for pose in range(len(turns)):
-        linear, translations, _, _ = joint_motions(turns[pose], shifts[pose], frames)
-        skin(linear, translations, influences, vertices[pose])
+    n_poses, n_joints = turns.shape[:2]
+    linear, translations = np.empty((n_poses, n_joints, 3, 3)), np.empty((n_poses, n_joints, 3))
+    move_joints(turns, shifts, frames, linear, translations)
+    for pose in range(n_poses):
+        skin(linear[pose], translations[pose], influences, vertices[pose])
 
 
 @compiled
