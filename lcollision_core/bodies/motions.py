@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from functools import cache, lru_cache, partial
+from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +37,10 @@ from lcollision_core.files import (
     read_pose_set,
 )
 from lcollision_core.files.animated import frame_rate
-from lcollision_core.files.changed_clips import ChangedClip, changed_gltf, clip_vertices
+from lcollision_core.files.changed_clips import ChangedClip, FileClips, changed_gltf
 from lcollision_core.files.character import ClipFrames
 from lcollision_core.files.character_reading import character_of, character_of_smpl
 from lcollision_core.files.character_writing import require_written
-from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.motion.bvh import read_bvh
 from lcollision_core.files.motion.generated import is_generated
 from lcollision_core.files.motion.smpl import (
@@ -51,20 +51,23 @@ from lcollision_core.files.motion.smpl import (
 )
 from lcollision_core.files.safe import atomic_write
 from lcollision_core.files.scene.joined import join_parts
-from lcollision_core.files.scene_files import as_file_error, open_rigged, read_scene, scene_of
+from lcollision_core.files.scene_files import open_rigged, read_scene
 from lcollision_core.files.table import (
     ANIMATED_SUFFIXES,
     BVH_SUFFIX,
     SCENE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
-from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.extents import box_corners
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import NOMINAL_RATE, GroundReport, Motion, is_worse, worse_spans
 from lcollision_core.motion.contacts import KeptContacts
 from lcollision_core.posing import ExactCheck, PoseSpace
+
+_AT_ONCE = 4
+"""Number of frames of a written file that a thread evaluates together."""
 
 _SAME_REST = 1e-9
 """Metres; tolerance for the joints of equal shapes."""
@@ -640,16 +643,17 @@ def write_clips(
     written = _ClipsOfFile(as_gltf(character), space, body.exact_check(), file)
     put_back: list[list[range]] = [[] for _ in changes]
     data = written.changed(changes)
-    was = written.changed([])
+    as_read = FileClips.read(data, file)
     for number, change in enumerate(changes):
-        put_back[number] = written.worse_spans(change, was, data)
+        put_back[number] = written.worse_spans(change, as_read)
     if any(put_back):
         changes = [
             replace(pair, spans=[span for span in pair.spans if span not in worse])
             for pair, worse in zip(changes, put_back, strict=True)
         ]
         data = written.changed(changes)
-    free = written.free(changes, data)
+        as_read = FileClips.read(data, file)
+    free = written.free(changes, as_read)
     with atomic_write(path) as out:
         out.write(data)
     return WrittenClips(free, written.made.notes, put_back)
@@ -736,30 +740,57 @@ class _ClipsOfFile:
             ],
         )
 
+    @cached_property
+    def _unchanged(self) -> FileClips:
+        return FileClips.read(self.changed([]), self.file)
+
     def _shown(
-        self, motion: Motion, frames: range, data: bytes
+        self, motion: Motion, frames: Sequence[int], clips: FileClips
     ) -> Iterator[npt.NDArray[np.float32]]:
         """Evaluate frames of a file: (V, 3) vertices in the body's coordinates, as read back."""
-        times, back = self._times(motion)[frames.start : frames.stop], self.made.frame.inverse()
-        for vertices in clip_vertices(data, self.file, motion.name, times):
+        back = self.made.frame.inverse()
+        for vertices in clips.vertices(motion.name, self._times(motion)[list(frames)]):
             yield back.apply(vertices[self.made.to_read]).astype(np.float32)
 
-    def worse_spans(self, change: MotionChange, was: bytes, data: bytes) -> list[range]:
-        """Return the spans that are worse in one file than in another, by their vertices."""
-        before, worse = change.before, []
-        for span in change.spans:
-            both = (self._shown(before, span, version) for version in (was, data))
-            for frame, (old, new) in zip(span, zip(*both, strict=True), strict=True):
-                frame_vertices = before.seen(self.check, range(frame, frame + 1))
-                if is_worse(frame_vertices, old, new, change.largest_change):
-                    worse.append(span)
-                    break
-        return worse
+    def worse_spans(self, change: MotionChange, clips: FileClips) -> list[range]:
+        """Return the spans that are worse in a file than unchanged, by their vertices."""
+        motion, most = change.before, change.largest_change
 
-    def free(self, changes: Sequence[MotionChange], data: bytes) -> list[npt.NDArray[np.bool_]]:
+        def is_worse_in(frames: range) -> bool:
+            checks = {at: motion.seen(self.check, range(at, at + 1)) for at in frames}
+            shown = dict(zip(frames, self._shown(motion, frames, clips), strict=True))
+            # A free frame is no worse than any other; only the rest are compared.
+            left = [
+                at for at in frames if most is not None or not checks[at].is_free_mesh(shown[at])
+            ]
+            return (
+                any(
+                    is_worse(checks[at], old, shown[at], most)
+                    for at, old in zip(
+                        left, self._shown(motion, left, self._unchanged), strict=True
+                    )
+                )
+                if left
+                else False
+            )
+
+        with ThreadPoolExecutor(available_cores(), "frames of a file") as pool:
+            return [
+                span
+                for span in change.spans
+                if any(
+                    pool.map(
+                        is_worse_in,
+                        [span[at : at + _AT_ONCE] for at in range(0, len(span), _AT_ONCE)],
+                    )
+                )
+            ]
+
+    def free(
+        self, changes: Sequence[MotionChange], clips: FileClips
+    ) -> list[npt.NDArray[np.bool_]]:
         """Return which frames of motions are free as read back from a file."""
-        with as_file_error(self.file):
-            character = character_of(scene_of(GltfDocument(data, self.file)), self.file)
+        character = character_of(clips.scene, self.file)
         back = self.made.frame.inverse()
         place = np.eye(4)
         place[:3, :3], place[:3, 3] = back.scale * back.rotation, back.translation
@@ -787,11 +818,7 @@ class _ClipsOfFile:
                 shown=vertices_of_frame,
                 shapes=self._numbers(character, frames),
             )
-            verdicts = (
-                motion.check(frame, self.check).is_free(motion.codes[frame])
-                for frame in range(len(motion))
-            )
-            free.append(np.fromiter(verdicts, np.bool_, len(motion)))
+            free.append(motion.are_free(self.check))
         return free
 
     def _numbers(self, character: Character, frames: ClipFrames) -> FloatArray | None:

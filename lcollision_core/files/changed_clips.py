@@ -15,18 +15,14 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.files.character import Character, CharacterFile, Rig
 from lcollision_core.files.gltf.clips import ClipTracks, Track, driven_property
 from lcollision_core.files.gltf.schema import PARTS, GltfDocument, stored_parts
-from lcollision_core.files.scene.joined import join_parts
-from lcollision_core.files.scene.scene import by_node
+from lcollision_core.files.scene.joined import JoinedMesh, join_parts
+from lcollision_core.files.scene.scene import Scene, by_node
 from lcollision_core.files.scene.transforms import unit_quaternions
 from lcollision_core.files.scene_files import as_file_error, scene_of
 from lcollision_core.meshes.topology import FloatArray
 
 _UNCHANGED = 1e-9
 """Largest entry of a joint's turn, or shift in the character's unit, that is rounding error."""
-
-_AT_ONCE = 16
-"""Number of frames that are evaluated together."""
-
 
 _SpanTimes = tuple[float | None, FloatArray, float | None]
 
@@ -95,19 +91,38 @@ def changed_gltf(character: Character, changes: Sequence[ChangedClip]) -> bytes:
         return written.encoded()
 
 
-def clip_vertices(data: bytes, path: Path, clip: str, times: FloatArray) -> Iterator[FloatArray]:
-    """Evaluate a clip of a written file as readers do, and yield (V, 3) vertices for each time.
+@dataclass(frozen=True, eq=False)
+class FileClips:
+    """The clips of a written file, evaluated as readers do.
 
-    Raises
-    ------
-    MeshFileError : the file cannot be read.
+    Attributes
+    ----------
+    path : of the file, for messages
+    scene : its contents
+    mesh : the joined parts of the scene
     """
-    with as_file_error(path):
-        scene = scene_of(GltfDocument(data, path))
-        mesh = join_parts(scene)
-        scene_clip = next(one for one in scene.clips if one.name == clip)
-        for start in range(0, len(times), _AT_ONCE):
-            yield from mesh.posed(scene_clip.sample(times[start : start + _AT_ONCE]))
+
+    path: Path
+    scene: Scene
+    mesh: JoinedMesh
+
+    @classmethod
+    def read(cls, data: bytes, path: Path) -> FileClips:
+        """Read the contents of a file.
+
+        Raises
+        ------
+        MeshFileError : the file cannot be read.
+        """
+        with as_file_error(path):
+            scene = scene_of(GltfDocument(data, path))
+            return cls(path, scene, join_parts(scene))
+
+    def vertices(self, clip: str, times: FloatArray) -> FloatArray:
+        """Return the (n, V, 3) vertices of a clip at (n,) times."""
+        scene_clip = next(one for one in self.scene.clips if one.name == clip)
+        with as_file_error(self.path):
+            return self.mesh.posed(scene_clip.sample(times))
 
 
 def _change(file: CharacterFile, patch: GltfDocument, rig: Rig, change: ChangedClip) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import ShapeError
+from lcollision_core.jobs import available_cores
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.contacts import KeptContacts
@@ -223,6 +225,14 @@ class Motion:
         between = (1.0 - share) * self.vertices(frame, check)
         between += share * self.vertices(frame + 1, check)
         return between
+
+    def are_free(self, check: ExactCheck) -> npt.NDArray[np.bool_]:
+        """Return (T,) whether each frame is free, checked on all cores."""
+        with ThreadPoolExecutor(available_cores(), "free frames") as pool:
+            verdicts = pool.map(
+                lambda frame: self.check(frame, check).is_free(self.codes[frame]), range(len(self))
+            )
+            return np.fromiter(verdicts, np.bool_, len(self))
 
     def collide(
         self, frames: Sequence[int], check: ExactCheck, share: float = 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -122,7 +123,7 @@ class JoinedMesh:
             raise MeshFileError("a pose of its nodes has coordinates that are not finite")
         return result
 
-    @property
+    @cached_property
     def _blend(self) -> sparse.csr_matrix:
         """Return the weights as a (V, B) matrix."""
         n_vertices = self.topology.n_vertices

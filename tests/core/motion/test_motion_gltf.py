@@ -10,7 +10,7 @@ import pytest
 from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.files import read_character
-from lcollision_core.files.changed_clips import ChangedClip, changed_gltf, clip_vertices
+from lcollision_core.files.changed_clips import ChangedClip, FileClips, changed_gltf
 from lcollision_core.files.gltf import schema
 from lcollision_core.files.gltf.clips import driven_property
 from lcollision_core.files.gltf.schema import GltfDocument
@@ -47,7 +47,7 @@ def test_readers_get_the_new_frames_and_elsewhere_the_old_motion(
     body = RigBody.of(read_character(source))
     changed, codes = change(body, spans)
     data = changed_gltf(body.character, [changed])
-    frames = list(clip_vertices(data, source, CLIP, changed.times))
+    frames = list(FileClips.read(data, source).vertices(CLIP, changed.times))
     size = body.body_size
     inside = np.concatenate([np.asarray(span) for span in spans])
     for frame in inside:
@@ -58,8 +58,8 @@ def test_readers_get_the_new_frames_and_elsewhere_the_old_motion(
         free[max(span.start - 1, 0) : span.stop] = False
     for share in (0.0, 0.3, 0.8):
         times = changed.times[:-1][free] + share / 30.0
-        old = clip_vertices(source.read_bytes(), source, CLIP, times)
-        new = clip_vertices(data, source, CLIP, times)
+        old = FileClips.read(source.read_bytes(), source).vertices(CLIP, times)
+        new = FileClips.read(data, source).vertices(CLIP, times)
         for one, other in zip(old, new, strict=True):
             assert np.abs(one - other).max() < 1e-5 * size
 
