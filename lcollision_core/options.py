@@ -590,8 +590,8 @@ class MotionOptions:
     budget: Annotated[
         float | None,
         Option(
-            "Seconds for each motion: what is done by then is written, the rest stays as it was "
-            "and is named.",
+            "Seconds for each motion: the best found by then is written where it makes nothing "
+            "worse, the rest stays as it was and is named.",
             metavar="SECONDS",
             low=0.001,
             high=1e6,

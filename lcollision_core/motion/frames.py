@@ -112,6 +112,11 @@ class Frames:
         moved = one - other
         return math.sqrt(max(float(moved @ self.metric @ moved), 0.0))
 
+    def is_free(self, frame: int, codes: FloatArray) -> bool:
+        """Return whether (D,) codes are free at a frame."""
+        self.job.check()
+        return self.check(frame).is_free(codes)
+
     def contacts(self, frame: int, codes: FloatArray) -> HalfSpacesOfPose | None:
         """Return half-spaces that separate the contacts of (D,) codes at a frame; None if free."""
         return self._separated(self.check(frame), codes)
@@ -157,25 +162,31 @@ class Frames:
         shaped = check.space.shaped_as(codes, blended_codes.astype(np.float64) / check.body_size)
         return self._separated(replace(check, space=shaped), codes)
 
-    def are_free(self, frames: range, job: Job = UNWATCHED) -> npt.NDArray[np.bool_]:
-        """Return which frames of the original motion are free."""
+    def are_free(
+        self, frames: Sequence[int], job: Job = UNWATCHED, codes: FloatArray | None = None
+    ) -> npt.NDArray[np.bool_]:
+        """Return which frames of the original motion, or with (n, D) other codes, are free."""
         motion, parts = self.motion, [np.empty(0, dtype=np.bool_)]
-        placements, codes = motion.placements or (), motion.codes
+        if codes is not None:
+            rows = np.array(motion.codes)
+            rows[np.asarray(frames, dtype=np.intp)] = codes
+            motion = replace(motion, codes=rows)
         alike = motion.hidden is None and all(
-            placement is None or placement.scale == 1.0 for placement in placements
+            placement is None or placement.scale == 1.0 for placement in motion.placements or ()
         )
 
-        def are_free(some: range) -> npt.NDArray[np.bool_]:
+        def are_free(some: Sequence[int]) -> npt.NDArray[np.bool_]:
             self.job.check()
             if alike:
                 return ~motion.collide(some, self._check)
-            return np.array([self.check(frame).is_free(codes[frame]) for frame in some])
+            return np.array([self.check(frame).is_free(motion.codes[frame]) for frame in some])
 
-        n_faces = self._check.space.topology.n_faces
+        n_faces, n_done = self._check.space.topology.n_faces, 0
         blocks = _blocks(frames, block_size(len(frames), n_faces, _BLOCK))
-        for some, block in zip(blocks, self.pool.map(are_free, blocks), strict=True):
+        for block in self.pool.map(are_free, blocks):
             parts.append(block)
-            job.report(some.stop - frames.start, len(frames))
+            n_done += len(block)
+            job.report(n_done, len(frames))
         return np.concatenate(parts)
 
     def collide_between(
@@ -273,7 +284,10 @@ _FLICKER = 10.0
 
 
 def chain_corrections(
-    frames: Frames, run: range, before: FloatArray | None = None
+    frames: Frames,
+    run: range,
+    before: FloatArray | None = None,
+    so_far: dict[int, FloatArray] | None = None,
 ) -> dict[int, FloatArray]:
     """Resolve a run of colliding frames in turn, forwards and backwards.
 
@@ -285,25 +299,37 @@ def chain_corrections(
     frames : of the motion
     run : colliding frames
     before : (D,) correction of the frame before the run; None if that is free
+    so_far : receives the corrections as frames are resolved, in case the work is stopped
 
     Returns
     -------
     corrections : (D,) by frame, of the frames that were resolved
     """
-    forwards, backwards = frames.pool.map(
-        lambda order: _chained(frames, *order), ((run, before), (reversed(run), None))
+    freed = {} if so_far is None else so_far
+    orders: tuple[tuple[Iterable[int], FloatArray | None], ...] = (
+        (run, before),
+        (reversed(run), None),
     )
-    return min(forwards, backwards, key=lambda found: _cost(frames, run, found, before))
+    forwards, backwards = frames.pool.map(
+        lambda order: _chained(frames, order[0], order[1], freed), orders
+    )
+    chosen = min(forwards, backwards, key=lambda found: _cost(frames, run, found, before))
+    freed.update(chosen)
+    return chosen
 
 
 def _chained(
-    frames: Frames, order: Iterable[int], near: FloatArray | None
+    frames: Frames,
+    order: Iterable[int],
+    near: FloatArray | None,
+    so_far: dict[int, FloatArray],
 ) -> dict[int, FloatArray]:
     chained: dict[int, FloatArray] = {}
     for frame in order:
         free = frames.resolved(frame, near)
         if free is not None:
             chained[frame] = near = free - frames.motion.codes[frame]
+            so_far.setdefault(frame, near)
     return chained
 
 

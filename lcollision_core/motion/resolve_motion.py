@@ -55,7 +55,7 @@ class ResolvedMotion:
     standing : (T, K) bool, the body parts that were kept on the ground in each frame
     touching : numbers of frames in `spans` that are free like the next, but with contact on the
         linear path of the vertices between; None if this was not checked
-    unfinished : spans, or ends of spans, that a stop has left unchanged
+    unfinished : spans, or ends of spans, of which a stop has left frames colliding
     kept : frames that were not resolved, and why
     ground : how the motion stands on the ground of its scene; None if this was not measured
     """
@@ -119,8 +119,8 @@ def resolve_motion(
     within : the frames that are checked and may change; all if None
     done : frames of an earlier run; windows whose frames are all done are not computed again
     keep : called with each frame of a new window once that is done, from one thread at a time
-    stop : ends the work early, polled like `job`: finished spans, and finished windows of long
-        ones, are the result; the others stay unchanged
+    stop : ends the work early, polled like `job`: the result has the finished spans, the finished
+        windows of long ones, and the frames that were freed in others, where that makes none worse
     checking : called with (frames checked, frames to check) before spans are known
 
     Returns
@@ -260,6 +260,7 @@ class _Resolution:
     reasons : why frames are barred
     unfinished : spans, or ends of spans, that were stopped
     solved : for a span, the number of its frames in finished windows
+    freed : for a span, the corrections that free frames of its unfinished window, by frame
     n_frames, n_done : number of frames of spans, and of those that are done
     """
 
@@ -282,6 +283,7 @@ class _Resolution:
     reasons: dict[int, Reason] = field(default_factory=dict)
     unfinished: list[range] = field(default_factory=list)
     solved: dict[range, int] = field(default_factory=dict)
+    freed: dict[range, dict[int, FloatArray]] = field(default_factory=dict)
     job: Job = UNWATCHED
     stop: Job | None = None
     done: Mapping[int, Solved] = field(default_factory=dict)
@@ -433,8 +435,13 @@ class _Resolution:
                 if self.job.cancelled:
                     raise
                 rest = self._without_finished(span)
-                self._bar(self._own(rest), Reason.STOPPED)
-                self.unfinished.append(rest)
+                freed = self.freed.pop(span, {})
+                if fixed := {at: freed[frame] for at, frame in enumerate(rest) if frame in freed}:
+                    self._fit(rest, fixed)
+                own = self._own(rest)
+                self._bar(own, Reason.STOPPED)
+                if (self.wanted & ~(self.after & self._is_moved))[own].any():
+                    self.unfinished.append(rest)
 
     def _without_finished(self, span: range) -> range:
         """Keep the finished beginning of a stopped span; return the rest, which is put back.
@@ -513,10 +520,12 @@ class _Resolution:
         after = corrections(window.stop) if ends and not is_open else None
         start = np.zeros((len(window), motion.codes.shape[1]))
         known = self.before[self._own(window)].copy()
+        freed = self.freed[span] = {}
         for run in runs(~known):
             frames_of_run = range(window.start + run.start, window.start + run.stop)
             near = before[1] if before is not None and run.start == 0 else None
-            for frame, correction in chain_corrections(frames, frames_of_run, near).items():
+            chained = chain_corrections(frames, frames_of_run, near, freed)
+            for frame, correction in chained.items():
                 start[frame - window.start], known[frame - window.start] = correction, True
         program = SpanProgram(
             frames,
@@ -530,7 +539,11 @@ class _Resolution:
             is_round and len(window) == n,
             tell,
         )
-        solution, free = program.solve()
+        try:
+            solution, free = program.solve()
+        except CancelledError:
+            freed |= {window.start + at: moved for at, moved in program.so_far().items()}
+            raise
         targets = motion.codes[window.start : window.stop]
         return list(zip(_added(targets, solution), free.tolist(), strict=True))
 
@@ -598,42 +611,58 @@ class _Resolution:
         for run in colliding_spans(self.colliding & self.barred, 0, None, self.is_cycle):
             span = self._eased(run)
             own = self._own(span)
-            targets = self.motion.codes[own]
-            wanted = np.zeros(targets.shape)
+            wanted = np.zeros(self.motion.codes[own].shape)
             inside = [number for number, at in enumerate(own) if self.colliding[at]]
             softened = self.frames.pool.map(lambda at: self.frames.softened(int(at)), own[inside])
             for number, codes in zip(inside, softened, strict=True):
-                wanted[number] = codes - targets[number]
-            bounds = [self.frames.limits(at) for at in own.tolist()]
-            low, high = (np.array(side) for side in zip(*bounds, strict=True))
-            places = {at: number for number, at in enumerate(own.tolist())}
-            still: set[int] = set()
-            for _ in range(_SOFT_ROUNDS):
-                smooth = self._smoothed(span, wanted, still)
-                if not smooth.any():
-                    break
-                self.codes[own] = _added(targets, np.clip(targets + smooth, low, high) - targets)
-                self.is_changed[own] = True
-                faults = self.guard.faults(span, self.codes, self.after, self._fractions)
-                if not faults:
-                    break
-                self._put_back(span)
-                # Keep the faults still, and smooth the others around them.
-                still |= {
-                    places[beside]
-                    for at in faults
-                    for beside in (at, (at + 1) % self.n)
-                    if beside in places
-                }
+                wanted[number] = codes - self.motion.codes[own[number]]
+            self._fit(span, {}, wanted)
 
-    def _smoothed(self, span: range, wanted: FloatArray, still: set[int]) -> FloatArray:
-        """Return smooth (len(span), D) corrections near the wanted ones, 0 in frames `still`."""
+    def _fit(
+        self, span: range, fixed: Mapping[int, FloatArray], wanted: FloatArray | None = None
+    ) -> None:
+        """Correct a span smoothly where that makes nothing worse.
+
+        Parameters
+        ----------
+        fixed : (D,) corrections of some frames, by their place in the span; others ease to them
+        wanted : (len(span), D) corrections to come near to; 0 if None
+        """
+        own, pinned = self._own(span), dict(fixed)
+        targets = self.motion.codes[own]
+        bounds = [self.frames.limits(at) for at in own.tolist()]
+        low, high = (np.array(side) for side in zip(*bounds, strict=True))
+        places = {at: number for number, at in enumerate(own.tolist())}
+        for _ in range(_SOFT_ROUNDS):
+            smooth = self._smoothed(
+                span, np.zeros(targets.shape) if wanted is None else wanted, pinned
+            )
+            if not smooth.any():
+                break
+            self.codes[own] = _added(targets, np.clip(targets + smooth, low, high) - targets)
+            self.is_changed[own] = True
+            faults = self.guard.faults(span, self.codes, self.after, self._fractions)
+            if not faults:
+                break
+            self._put_back(span)
+            # Keep the faults still, and smooth the others around them.
+            still = {places.get(at, -1) for fault in faults for at in (fault, (fault + 1) % self.n)}
+            pinned |= dict.fromkeys(still - {-1}, np.zeros(targets.shape[1]))
+
+    def _smoothed(
+        self, span: range, wanted: FloatArray, pinned: Mapping[int, FloatArray]
+    ) -> FloatArray:
+        """Return smooth (len(span), D) corrections near the wanted ones, with some given."""
         size = wanted.shape[1]
+        is_round = self.is_cycle and len(span) == self.n
         is_open = not self.is_cycle and span.start == 0, not self.is_cycle and span.stop == self.n
-        before, after = (None if is_end_open else np.zeros((2, size)) for is_end_open in is_open)
-        pinned = {number: np.zeros(size) for number in still}
-        kernel = TimeKernel.of(len(span), self._smoothness, before, after, pinned, size)
-        return kernel.spread @ wanted
+        before, after = (
+            None if is_end_open or is_round else np.zeros((2, size)) for is_end_open in is_open
+        )
+        kernel = TimeKernel.of(
+            len(span), self._smoothness, before, after, pinned, size, is_cycle=is_round
+        )
+        return kernel.spread @ wanted + kernel.mean
 
     def _eased(self, run: range) -> range:
         """Extend a run by the frames on both sides over which its correction may fade."""
@@ -649,9 +678,14 @@ class _Resolution:
         before = steps(range(first - 1, first - 1 - easing, -1))
         return range(first - before, run.stop + steps(range(run.stop, run.stop + easing)))
 
+    @property
+    def _is_moved(self) -> npt.NDArray[np.bool_]:
+        moved: npt.NDArray[np.bool_] = (self.codes != self.motion.codes[: self.n]).any(axis=1)
+        return moved
+
     def _kept(self) -> tuple[KeptSpan, ...]:
-        is_left = (self.barred & self.colliding) | ~self.after
-        is_moved = (self.codes != self.motion.codes[: self.n]).any(axis=1)
+        is_moved = self._is_moved
+        is_left = (self.barred & self.colliding & ~(self.after & is_moved)) | ~self.after
         spans = [
             self.guard.kept(run, self.codes, self.reasons)
             for side in (is_left & is_moved, is_left & ~is_moved)

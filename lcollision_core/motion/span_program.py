@@ -246,9 +246,13 @@ _STALLED, _NEARER = 4, 0.95
 """Rounds without progress after which patches are left apart, if all is free, and the share of
 their lacking distance below which there is progress."""
 
-_SEARCHES, _SETTLED = 6, 0.98
-"""Most searches of a span, and the share of the cost that another search must go below to count as
-better."""
+_SEARCHES, _SETTLED = 6, 0.95
+"""Most searches of a span, and the share of the cost that a search must go below to be followed by
+another one."""
+
+_STILL = 1e-4
+"""Normalised distance from a pose that was free within which a frame is taken as free, until all
+others are."""
 
 _REMEMBERED = 6, 3
 """Number of poses whose contacts are used, for each frame and between frames."""
@@ -329,12 +333,17 @@ class SpanProgram:
     _between: dict[tuple[int, float], list[HalfSpacesOfPose]] = field(default_factory=dict)
     _limits: dict[tuple[int, int], float] = field(default_factory=dict)
     _pulls: dict[int, Pulls] = field(default_factory=dict)
+    _clear: dict[tuple[int, float], FloatArray] = field(default_factory=dict)
+    _best: _Evaluation | None = None
 
     def __post_init__(self) -> None:
         self._targets = self.frames.motion.codes[self.span.start : self.span.stop]
         self._contacts = [[] for _ in self.span]
         # The newest known free pose of each frame.
         self._known, self._is_known = self._targets + self.start, self.is_free.copy()
+        self._is_free_before = self.is_free & ~self.start.any(axis=1)
+        # Whether that is the pose in which the frame was checked last.
+        self._was_free = self._is_free_before.copy()
         bounds = [self.frames.limits(frame) for frame in self.span]
         # Whether half-spaces are moved to hold known free poses: frees less, but bends less.
         self._gives_way = True
@@ -347,20 +356,30 @@ class SpanProgram:
             # Search again without the touches that stay apart.
             best = self._search()
         for _ in range(1, _SEARCHES):
+            self._best = best
             if self._is_settled(best) and (best.score > 0.0 or not best.corrections.any()):
                 break
             self._gives_way = gives_way
             self._forget(best)
             solution = self._search()
             gives_way = self._is_settled(solution)
-            worth = *solution.rank, self._cost(solution.corrections)
-            if worth < (*best.rank, _SETTLED * self._cost(best.corrections)):
+            before, after = self._worth(best), self._worth(solution)
+            if after < before:
                 best = solution
+                if after > (*before[:2], _SETTLED * before[2]):
+                    break
             elif gives_way or not self._gives_way:
                 break
         put_back: npt.NDArray[np.bool_] = ~best.is_free & self._is_known
         chosen = np.where(put_back[:, None], self._known - self._targets, best.corrections)
         return chosen, best.is_free | put_back
+
+    def so_far(self) -> dict[int, FloatArray]:
+        """Return the (D,) corrections that free frames, if the search is stopped."""
+        if self._best is not None and self._is_settled(self._best):
+            return dict(enumerate(self._best.corrections))
+        freed = self._is_known & ~self._is_free_before
+        return {at: self._known[at] - self._targets[at] for at in np.flatnonzero(freed).tolist()}
 
     def _drop_contacts(self, best: _Evaluation) -> bool:
         """Leave out touches that stay apart; return whether there are any."""
@@ -383,6 +402,8 @@ class SpanProgram:
         ends = self._targets + best.corrections
         self._known = np.where(best.is_free[:, None], ends, self._known)
         self._is_known |= best.is_free
+        self._known[self._is_free_before] = self._targets[self._is_free_before]
+        self._was_free = self._is_free_before.copy()
 
     def _search(self) -> _Evaluation:
         """Return the first corrections that free all frames, else the best of all rounds."""
@@ -418,11 +439,13 @@ class SpanProgram:
             least = min(least, now.lack)
             if self._is_settled(now) and (now.n_apart == 0 or n_stalled >= _STALLED):
                 is_better = now.rank <= min(best.rank, (now.score, start.n_apart))
-                return now if is_better and (now.score == 0.0 or now.score < start.score) else best
+                if is_better and (now.score == 0.0 or now.score < start.score):
+                    return now
+                break
             # Corrections must be better than none.
             if now.rank <= best.rank and now.rank < start.rank:
                 best = now
-        return best
+        return self._look(best.corrections, {}, resolves=False, still=0.0)
 
     def _is_settled(self, now: _Evaluation) -> bool:
         """Whether all is free except frames for which no free pose was found."""
@@ -452,6 +475,9 @@ class SpanProgram:
                 stuck.append(at)
         return stuck
 
+    def _worth(self, solution: _Evaluation) -> tuple[float, int, float]:
+        return *solution.rank, self._cost(solution.corrections)
+
     def _cost(self, corrections: FloatArray) -> float:
         """Return the objective of the program."""
         rows = np.concatenate([corrections, corrections[:2]]) if self.is_cycle else corrections
@@ -470,13 +496,42 @@ class SpanProgram:
     def _evaluate(
         self, corrections: FloatArray, pinned: dict[int, FloatArray], resolves: bool
     ) -> _Evaluation:
-        """Collect the contacts of corrections."""
+        """Collect the contacts of corrections; frames that hardly move are checked last."""
+        now = self._look(corrections, pinned, resolves, _STILL)
+        return self._look(corrections, pinned, False, 0.0) if self._is_settled(now) else now
+
+    def _look(
+        self,
+        corrections: FloatArray,
+        pinned: dict[int, FloatArray],
+        resolves: bool,
+        still: float,
+    ) -> _Evaluation:
+        """Collect the contacts of corrections.
+
+        Parameters
+        ----------
+        pinned : frames that are free
+        resolves : whether colliding frames look for a nearer free pose
+        still : distance from a pose that was free within which a frame counts as free
+        """
         poses = self._targets + corrections
-        n = len(poses)
+        n, frames = len(poses), self.frames
         asked = [at for at in range(n) if at not in pinned]
-        reached = self.frames.pool.map(lambda at: self._reached(at, poses[at], resolves), asked)
+        asked = [
+            at
+            for at in asked
+            if not (self._was_free[at] and self._is_near(poses[at], self._known[at], still))
+        ]
+        # Most frames that were free still are; a check without contacts is faster.
+        likely = [at for at in asked if self._was_free[at]]
+        verdicts = frames.are_free([self.span[at] for at in likely], codes=poses[likely])
+        now_free = set(np.compress(verdicts, likely).tolist())
+        self._known[list(now_free)] = poses[list(now_free)]
+        asked = [at for at in asked if at not in now_free]
+        reached = frames.pool.map(lambda at: self._reached(at, poses[at], resolves), asked)
         is_free = np.ones(n, dtype=np.bool_)
-        is_free[asked] = list(reached)
+        is_free[asked] = self._was_free[asked] = list(reached)
         is_whole = self._are_hopeless(~is_free)
         places = [
             (at, fraction)
@@ -486,6 +541,16 @@ class SpanProgram:
             # Frames come first: what lies between them moves with them.
             if is_whole or (at, fraction) in self._between
         ]
+        middles = {
+            (at, share): (1.0 - share) * poses[at] + share * poses[(at + 1) % n]
+            for at, share in places
+        }
+        places = [
+            place
+            for place in places
+            if place not in self._clear
+            or not self._is_near(middles[place], self._clear[place], still)
+        ]
         self._pulls = {}
         for at, pulls in enumerate(
             self.frames.pool.map(self.frames.pulls, self.span, poses)
@@ -494,15 +559,18 @@ class SpanProgram:
         ):
             if pulls is not None:
                 self._pulls[at] = pulls
-        middles = self.frames.pool.map(
-            lambda place: self.frames.contacts_between(
+        half_spaces = frames.pool.map(
+            lambda place: frames.contacts_between(
                 self.span[place[0]], place[1], poses[place[0]], poses[(place[0] + 1) % n]
             ),
             places,
         )
         between = []
-        for place, contacts in zip(places, middles, strict=True):
-            if contacts is not None:
+        for place, contacts in zip(places, half_spaces, strict=True):
+            self._clear.pop(place, None)
+            if contacts is None:
+                self._clear[place] = middles[place]
+            else:
                 between.append(place[0])
                 self._between.setdefault(place, []).append(contacts)
         n_apart = sum(pulls.n_apart for pulls in self._pulls.values())
@@ -511,9 +579,8 @@ class SpanProgram:
 
     def _reached(self, at: int, goal: FloatArray, resolves: bool) -> bool:
         """Collect the contacts of one frame on its way to a pose; return whether that is free."""
-        frames, frame = self.frames, self.span[at]
-        contacts = frames.contacts(frame, goal)
-        if contacts is None:
+        frames, frame, colliding = self.frames, self.span[at], goal
+        if frames.is_free(frame, goal):
             self._known[at], self._is_known[at] = goal, True
             return True
         if resolves:
@@ -524,20 +591,26 @@ class SpanProgram:
             ):
                 self._known[at], self._is_known[at] = near, True
         if self._is_known[at]:
-            free, colliding = self._known[at], goal
+            free = self._known[at]
             apart = frames.distance(free, colliding)
             for _ in range(_HALVINGS):
                 if apart <= _NEAR:
                     break
                 middle, apart = 0.5 * (free + colliding), 0.5 * apart
-                touched = frames.contacts(frame, middle)
-                if touched is None:
+                if frames.is_free(frame, middle):
                     free = middle
                 else:
-                    colliding, contacts = middle, touched
+                    colliding = middle
             self._known[at] = free
-        self._contacts[at].append(contacts)
+        contacts = frames.contacts(frame, colliding)
+        if contacts is not None:
+            self._contacts[at].append(contacts)
         return False
+
+    def _is_near(self, pose: FloatArray, known: FloatArray, still: float) -> bool:
+        if still == 0.0:
+            return np.array_equal(pose, known)
+        return self.frames.distance(pose, known) <= still
 
     def _settle(self, kernel: TimeKernel, pinned: dict[int, FloatArray]) -> FloatArray | None:
         """Return the smoothest corrections that all contacts and limits allow, or None."""

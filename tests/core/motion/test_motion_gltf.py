@@ -97,7 +97,7 @@ def test_rotations_of_any_length_are_read_back_as_they_were_read(tmp_path: Path)
     body = RigBody.of(read_character(source))
     changed, codes = change(body, [SPAN])
     data = changed_gltf(body.character, [changed])
-    frames = list(clip_vertices(data, source, CLIP, changed.times))
+    frames = list(FileClips.read(data, source).vertices(CLIP, changed.times))
     for frame in SPAN:
         assert np.abs(frames[frame] - body.decode(codes[frame])).max() < 1e-5 * body.body_size
 

@@ -20,6 +20,7 @@ from lcollision_core.motion import (
     Motion,
     MotionOptions,
     MotionReport,
+    Reason,
     ResolvedMotion,
     Solved,
     resolve_motion,
@@ -251,6 +252,40 @@ def test_a_run_that_is_to_end_keeps_the_windows_that_are_done(
     outside = np.setdiff1d(np.arange(len(motion)), done)
     assert codes[outside].tobytes() == motion.codes[outside].tobytes()
     assert found.after.tolist() == [bool(free) for free in check.are_free(codes)]
+
+
+@pytest.mark.parametrize(("share_of_polls", "all_free"), [(0.1, False), (0.3, True)])
+def test_a_span_that_is_stopped_keeps_the_best_found_by_then(
+    share_of_polls: float, all_free: bool
+) -> None:
+    body, motion = swinging()
+
+    class Stop(Job):
+        n_polls, last = 0, float("inf")
+
+        @property
+        def cancelled(self) -> bool:
+            self.n_polls += 1
+            return self.n_polls > self.last
+
+    stop = Stop()
+    whole = resolve_motion(body.resolver, motion, UP, OPTIONS, 1, stop=stop)
+    assert whole.after.all()
+    stop.last, stop.n_polls = share_of_polls * stop.n_polls, 0
+    found = resolve_motion(body.resolver, motion, UP, OPTIONS, 1, stop=stop)
+    check, codes = body.exact_check(), found.motion.codes
+    assert found.after.tolist() == [bool(free) for free in check.are_free(codes)]
+    assert found.before.sum() < found.after.sum()
+    assert (found.after | ~found.before).all()
+    assert found.after.all() == (not found.unfinished) == all_free
+    assert {span.reason for span in found.kept} == (set() if all_free else {Reason.STOPPED})
+    colliding = np.flatnonzero(~found.after)
+    assert {at for span in found.kept for at in range(span.frames[0], span.frames[1] + 1)} == set(
+        colliding.tolist()
+    )
+    (start, *_), (*_, end) = found.spans[0], found.spans[-1]
+    outside = np.setdiff1d(np.arange(len(motion)), range(start, end + 1))
+    assert codes[outside].tobytes() == motion.codes[outside].tobytes()
 
 
 def test_a_frame_that_cannot_be_freed_ends_nothing() -> None:
