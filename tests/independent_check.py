@@ -103,8 +103,9 @@ class IndependentRules:
         for a, b in touching_at_rest:
             self._touched.setdefault(a, set()).add(b)
             self._touched.setdefault(b, set()).add(a)
-        self._patches = rules["touching"]
-        self._patch_radius = rules["touching_radius"] * size
+        self._patches = [
+            ("touching", *pair, rules["touching_radius"] * size) for pair in rules["touching"]
+        ] + [("shape", *pair, 0.02 * size) for pair in rules["shape_touching"]]
         self._around: dict[tuple[int, float], set[int]] = {}
 
     def _fold_limits(
@@ -165,10 +166,10 @@ class IndependentRules:
             return "tolerated"
         if any(a in about and b in about for about in self._joints):
             return "joint"
-        for one, two in self._patches:
-            first, second = (self._faces_around(face, self._patch_radius) for face in (one, two))
+        for rule, one, two, radius in self._patches:
+            first, second = (self._faces_around(face, radius) for face in (one, two))
             if (a in first and b in second) or (b in first and a in second):
-                return "touching"
+                return rule
         return None
 
     def _is_of(self, one: str, two: str, a: int, b: int) -> bool:

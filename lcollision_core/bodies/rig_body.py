@@ -38,6 +38,7 @@ from lcollision_core.bodies.rig_space import ROOT_CODES, SHIFTS, RigPoseSpace
 from lcollision_core.bodies.skeletons import ROLE_NAMES, joint_parts
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.contact.exclusions import near_pairs_estimate
+from lcollision_core.contact.propose import patches_about
 from lcollision_core.devices import block_size
 from lcollision_core.embedding.bilevel import LatentFit
 from lcollision_core.errors import (
@@ -52,7 +53,11 @@ from lcollision_core.files.pose_set import require_usable_reference
 from lcollision_core.files.safe import MAX_ITEMS
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import fit_rigid, part_groups
-from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION, MAX_GROUP_NAME_LENGTH
+from lcollision_core.meshes.contact_rules import (
+    CHARACTER_REST_EXCLUSION,
+    MAX_GROUP_NAME_LENGTH,
+    TOUCHING_RADIUS,
+)
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
@@ -252,6 +257,40 @@ def default_rules(character: Character, groups: Sequence[FaceGroup] = ()) -> Con
         rest_exclusion=CHARACTER_REST_EXCLUSION if few else 0.0,
         joint_exclusion=has_joints,
     )
+
+
+_SHAPE_SHARES = np.array([[0.25], [0.5], [0.75], [1.0]])
+"""Shares of a morph target's range at which contact is looked for."""
+
+
+def shape_patches(space: RigPoseSpace, detector: CollisionDetector) -> tuple[tuple[int, int], ...]:
+    """Find patches that a morph target alone brings into contact, such as closed lids and lashes.
+
+    Parameters
+    ----------
+    space : with morph targets
+    detector : by the other default rules
+
+    Returns
+    -------
+    pairs of faces in the middle of two patches, for `ContactRules.shape_touching`
+    """
+    corners = detector.reference[detector.topology.faces]
+    lowest, highest = corners.min(axis=1), corners.max(axis=1)
+    touching = [np.empty((0, 2), dtype=np.int32)]
+    for end in (space.low, space.high):
+        for shape in np.flatnonzero(space.are_shapes & (end != 0.0)):
+            codes = np.zeros((len(_SHAPE_SHARES), len(end)))
+            codes[:, shape] = _SHAPE_SHARES[:, 0] * end[shape]
+            poses = (space.decode(codes) * space.body_size).astype(np.float32)
+            moves = np.abs(poses[-1] - detector.reference).max(axis=1) > _SAME * detector.body_size
+            if not moves.any():
+                continue
+            places = np.concatenate([poses[-1, moves], detector.reference[moves]])
+            is_far = (highest < places.min(axis=0)) | (lowest > places.max(axis=0))
+            near = detector.without(np.flatnonzero(is_far.any(axis=1)))
+            touching += [near.detect(pose, counted_only=True).pairs for pose in poses]
+    return patches_about(detector, np.unique(np.concatenate(touching), axis=0), TOUCHING_RADIUS)
 
 
 _STEPS = 3
@@ -480,7 +519,14 @@ class RigBody(Body):
             metres=character.metres,
             groups=groups,
         )
-        return cls(character, space, card, poses)
+        body = cls(character, space, card, poses)
+        patches = shape_patches(space, body.detector) if space.n_shapes else ()
+        if not patches:
+            return body
+        rules = replace(card.rules, shape_touching=patches)
+        ruled = cls(character, space, replace(card, rules=rules), poses)
+        vars(ruled)["detector"] = body.detector.with_rules(rules, groups)
+        return ruled
 
     def with_roles(self, chosen: Mapping[str, str]) -> RigBody:
         """Return the character with other joint roles, and its default rules.

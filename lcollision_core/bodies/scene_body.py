@@ -289,6 +289,7 @@ class SceneBody(Body):
         left_out: list[str] = []
         tolerated: list[tuple[str, str, float]] = []
         touching: list[tuple[int, int]] = []
+        in_shapes: list[tuple[int, int]] = []
         bending = [member.body for member in self.members if member.moves and _bends(member.body)]
         # Joints crease what they turn: without their exclusions characters collide at rest.
         jointed = [body for body in bending if body.joints is not None]
@@ -316,7 +317,11 @@ class SceneBody(Body):
             ]
             if rules.tolerated_depth:
                 tolerated.append((name, name, rules.tolerated_depth))
-            touching += [(a + rows.start, b + rows.start) for a, b in rules.touching]
+            for joined, patches in (
+                (touching, rules.touching),
+                (in_shapes, rules.shape_touching),
+            ):
+                joined += [(a + rows.start, b + rows.start) for a, b in patches]
             is_prop = member.holder is not None or (member.moves and not _bends(member.body))
             if is_prop and not member.is_fixed:
                 ignored.append((name, name))
@@ -342,6 +347,7 @@ class SceneBody(Body):
                 touching_radius=max((rules.touching_radius for rules in posed), default=0.0),
                 left_out=tuple(left_out),
                 tolerated_pairs=tuple(tolerated),
+                shape_touching=tuple(in_shapes),
             ),
             (*others, *joints),
         )

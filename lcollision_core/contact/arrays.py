@@ -43,8 +43,8 @@ class Exclusions(NamedTuple):
     ``face[start[f]:start[f + 1]]``. Pairs of groups are kept by region, as two groups relate too
     many faces for a list. The joints that face f lies about are
     ``joint[joint_start[f]:joint_start[f + 1]]``: two faces about one joint do not count. Pairs that
-    nearly always touch are listed like those that touch at rest. Lists are ascending, and all of
-    one kind may be missing.
+    nearly always touch, or touch in shapes, are listed like those that touch at rest. Lists are
+    ascending, and all of one kind may be missing.
 
     Attributes
     ----------
@@ -62,6 +62,8 @@ class Exclusions(NamedTuple):
     joint : (k,) int32, joint numbers
     touching_start : (F + 1,) or (1,) int64
     touching : (t,) int32, face indices
+    shape_start : (F + 1,) or (1,) int64
+    shape : (s,) int32, face indices
     """
 
     corners: IntArray
@@ -76,6 +78,8 @@ class Exclusions(NamedTuple):
     joint: IntArray
     touching_start: npt.NDArray[np.int64]
     touching: IntArray
+    shape_start: npt.NDArray[np.int64]
+    shape: IntArray
 
 
 class ClearanceRule(NamedTuple):

@@ -27,7 +27,7 @@ from lcollision_core.contact.reach import (
     with_pairs,
 )
 from lcollision_core.errors import ShapeError
-from lcollision_core.meshes.contact_rules import ContactRules
+from lcollision_core.meshes.contact_rules import TOUCHING_RADIUS, ContactRules
 from lcollision_core.meshes.face_groups import FaceGroup, require_groups, without_joints
 from lcollision_core.meshes.topology import FloatArray, Topology
 
@@ -92,6 +92,8 @@ def exclusions_of(
         joint=none.entry,
         touching_start=none.start,
         touching=none.entry,
+        shape_start=none.start,
+        shape=none.entry,
     )
     return with_other_rules(listed, rules, topology, reference, body_size, groups)
 
@@ -147,14 +149,13 @@ def with_other_rules(
     region, ignored, squared_tolerance = _regions(rules, without_joints(groups), n_faces)
     joints = [group.faces for group in groups if group.about_joint and rules.joint_exclusion]
     by_joint = lists_of(joints, n_faces) if joints else no_lists(0)
-    pairs = np.array(rules.touching, dtype=np.int64).reshape(-1, 2)
-    if len(pairs) and pairs.max() >= n_faces:
-        whose = "of faces of this mesh"
-        raise ShapeError.must_be("the pairs that nearly always touch", whose, int(pairs.max()))
-    by_touch = no_lists(0)
-    if len(pairs):
-        radius = rules.touching_radius * body_size
-        by_touch = _about(topology, reference, pairs, radius, _TOUCHING)
+    by_touch, by_shape = (
+        _about(topology, reference, _faces_of(patches, n_faces), radius * body_size, _TOUCHING)
+        for patches, radius in (
+            (rules.touching, rules.touching_radius),
+            (rules.shape_touching, TOUCHING_RADIUS),
+        )
+    )
     return exclusions._replace(
         region=region,
         ignored=ignored,
@@ -163,7 +164,18 @@ def with_other_rules(
         joint=by_joint.entry,
         touching_start=by_touch.start,
         touching=by_touch.entry,
+        shape_start=by_shape.start,
+        shape=by_shape.entry,
     )
+
+
+def _faces_of(patches: Sequence[tuple[int, int]], n_faces: int) -> Pairs:
+    """Return (n, 2) faces in the middle of pairs of patches."""
+    pairs = np.array(patches, dtype=np.int64).reshape(-1, 2)
+    if pairs.max(initial=-1) >= n_faces:
+        whose = "of faces of this mesh"
+        raise ShapeError.must_be("the pairs of patches that touch", whose, int(pairs.max()))
+    return pairs
 
 
 def _about(

@@ -44,8 +44,8 @@ Within it, products of coordinates stay far from overflow."""
 SMALL_SINE_SQUARED = 1e-6
 """Squared sine of their angle below which two edges' cross product is corrected for rounding."""
 
-N_KINDS = 8
-COUNTED, NEAR, REST, IGNORED, TOLERATED, JOINT, TOUCHING, COINCIDENT = range(N_KINDS)
+N_KINDS = 9
+COUNTED, NEAR, REST, IGNORED, TOLERATED, JOINT, TOUCHING, SHAPE, COINCIDENT = range(N_KINDS)
 """Kind of a pair of faces: it counts; a rule, in the order of `RuleCounts`, excludes it; or its
 faces coincide, which is no collision."""
 
@@ -362,6 +362,10 @@ def rule_of(face_a, face_b, squared_depth, exclusions):
         exclusions.touching_start, exclusions.touching, first, second
     ):
         return np.uint8(TOUCHING)
+    if len(exclusions.shape_start) > 1 and _is_listed(
+        exclusions.shape_start, exclusions.shape, first, second
+    ):
+        return np.uint8(SHAPE)
     return np.uint8(COUNTED)
 
 

@@ -110,6 +110,20 @@ def touching_patches(
     return _covering(of_first.tocsc(), of_second.tocsc(), patches[is_frequent], middles)
 
 
+def patches_about(
+    detector: CollisionDetector, pairs: npt.NDArray[np.int32], radius: float
+) -> tuple[tuple[int, int], ...]:
+    """Cover (n, 2) pairs of faces by pairs of patches, as `touching_patches` does."""
+    if not len(pairs):
+        return ()
+    middles, near = _patches(detector, np.unique(pairs), radius)
+    of_first, of_second = near[pairs[:, 0]], near[pairs[:, 1]]
+    one_way = of_first.T @ of_second
+    touching = sparse.triu(one_way + one_way.T).tocoo()
+    patches = np.stack([touching.row, touching.col], axis=1)
+    return _covering(of_first.tocsc(), of_second.tocsc(), patches, middles)
+
+
 def _of_touching_pieces(
     detector: CollisionDetector,
     found: Sequence[npt.NDArray[np.int32]],

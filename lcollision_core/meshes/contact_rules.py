@@ -20,7 +20,7 @@ CHARACTER_REST_EXCLUSION = 0.02
 """Normalised length: the rest exclusion of characters, found by measurements on several."""
 
 TOUCHING_RADIUS = 0.02
-"""Normalised length: the radius of patches that a proposal leaves out."""
+"""Normalised length: the radius of patches that a proposal, or contact in shapes, leaves out."""
 
 MAX_TOUCHING = 4000
 """Most pairs of patches that touch in nearly every pose."""
@@ -46,6 +46,7 @@ class RuleCounts:
     tolerated : pairs no deeper than the tolerated depth, in general or of their groups
     joint : pairs about a joint that links their parts
     touching : pairs at patches that touch in nearly every pose
+    shape : pairs at patches that a morph target alone brings into contact
     """
 
     near: int = 0
@@ -54,6 +55,7 @@ class RuleCounts:
     tolerated: int = 0
     joint: int = 0
     touching: int = 0
+    shape: int = 0
 
     @classmethod
     def of(cls, rule: npt.NDArray[np.integer]) -> RuleCounts:
@@ -170,6 +172,8 @@ class ContactRules:
     left_out : names of groups whose pairs do not count; they are still posed, shown and exported
     tolerated_pairs : pairs of names of groups with a depth that replaces the tolerated depth for
         pairs of one face from each group; if several apply, the least
+    shape_touching : pairs of faces at the centres of patches that a morph target alone brings into
+        contact; pairs with one face within `TOUCHING_RADIUS` of each of the two do not count
 
     Raises
     ------
@@ -187,6 +191,7 @@ class ContactRules:
     left_out: tuple[str, ...] = ()
     tolerated_pairs: tuple[tuple[str, str, float], ...] = ()
     near_by_limb: bool = False
+    shape_touching: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self) -> None:
         for what, length in (
@@ -200,12 +205,11 @@ class ContactRules:
         for what, pairs in (("ignored", self.ignored), ("tolerated", self.tolerated_pairs)):
             if len(pairs) > MAX_IGNORED:
                 raise ShapeError.must_be(f"{what} pairs", f"at most {MAX_IGNORED}", len(pairs))
-        if len(self.touching) > MAX_TOUCHING:
-            raise ShapeError.must_be(
-                "touching pairs", f"at most {MAX_TOUCHING}", len(self.touching)
-            )
-        if any(len(pair) != 2 or min(pair) < 0 for pair in self.touching):
-            raise ShapeError("must be two faces by number", where="a touching pair")
+        for patches in (self.touching, self.shape_touching):
+            if len(patches) > MAX_TOUCHING:
+                raise ShapeError.must_be("touching pairs", f"at most {MAX_TOUCHING}", len(patches))
+            if any(len(pair) != 2 or min(pair) < 0 for pair in patches):
+                raise ShapeError("must be two faces by number", where="a touching pair")
         for pair in self.ignored:
             if len(pair) != 2 or not all(map(_is_name, pair)):
                 raise ShapeError.must_be(
@@ -271,6 +275,8 @@ class ContactRules:
             self.joint_exclusion and "pairs at a joint that links their parts",
             self.touching
             and f"pairs at {len(self.touching)} places that touch in nearly every pose",
+            self.shape_touching
+            and f"pairs at {len(self.shape_touching)} places that a shape brings into contact",
         )
         return ", ".join(what for what in descriptions if what)
 
@@ -283,6 +289,7 @@ class ContactRules:
             "tolerated": self.tolerate_something,
             "joint": self.joint_exclusion,
             "touching": self.touching,
+            "shape": self.shape_touching,
         }
         short_names = (_SHORTLY[name] for name, does in applies.items() if does)
         return ", ".join(filter(None, (self.left_out_in_words(), *short_names)))
@@ -327,6 +334,7 @@ class ContactRules:
                 (counts.tolerated, f"not deeper than {self._tolerated_in_words()}"),
                 (counts.joint, f"at {'a joint' if counts.joint == 1 else 'joints'}"),
                 (counts.touching, "at places that nearly always touch"),
+                (counts.shape, "at places that a shape brings into contact"),
             )
             if number
         ]
@@ -353,6 +361,7 @@ _SHORTLY = {
     "tolerated": "not deeper than tolerated",
     "joint": "at joints",
     "touching": "at places that nearly always touch",
+    "shape": "at places that a shape brings into contact",
 }
 
 _NAMED_PAIRS = 3

@@ -91,7 +91,8 @@ class ContactsDialog(Dialog):
     total : label with the number of pairs that count at rest
     kept : label that says where changes are stored, or why nothing can be changed
     counts : labels of the counts by rule, keyed by the fields of `RuleCounts`
-    always : box that excludes places that touch in nearly every pose
+    always, in_shapes : boxes that exclude places that touch in nearly every pose, and places that a
+        morph target brings into contact; the latter only for bodies with such places
 
     Signals
     -------
@@ -108,11 +109,16 @@ class ContactsDialog(Dialog):
         self.near, self.rest, self.tolerated = (self._field(name) for name in _MOST)
         self.at_rest, self.at_joints = QCheckBox("Touching at rest"), QCheckBox("Creases at joints")
         self.always = QCheckBox("Always touching")
+        self.in_shapes = QCheckBox("Touching in shapes")
+        self.in_shapes.setToolTip(
+            "Closed lids, lashes, lips: places that a shape brings into contact"
+        )
         bold = self.at_rest.font()
         bold.setBold(True)
-        for box in (self.at_rest, self.at_joints, self.always):
+        boxes = self.at_rest, self.at_joints, self.always, self.in_shapes
+        for box in boxes:
             box.setFont(bold)
-        names = (*_MOST, "joint", "touching", "ignored")
+        names = (*_MOST, "joint", "touching", "shape", "ignored")
         self.counts = {name: labelled("", "caption") for name in names}
         for label in self.counts.values():
             label.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
@@ -121,7 +127,7 @@ class ContactsDialog(Dialog):
         self._tint.setObjectName("caption")
         self.kept = self._note("")
         self._lay_out()
-        for box in (self.at_rest, self.at_joints, self.always):
+        for box in boxes:
             box.toggled.connect(self._on_edited)
         for field in (self.near, self.rest, self.tolerated):
             field.valueChanged.connect(self._on_edited)
@@ -161,6 +167,7 @@ class ContactsDialog(Dialog):
             ),
             hbox(self.at_joints, None, self.counts["joint"]),
             hbox(self.always, None, self.counts["touching"]),
+            hbox(self.in_shapes, None, self.counts["shape"]),
             self._ignored_part(),
             self.total,
             self._tint,
@@ -258,6 +265,7 @@ class ContactsDialog(Dialog):
                 entry for entry, item in self._tolerated.items() if item.checkState(0) is _CHECKED
             ),
             self._near_by_limb(),
+            self._shape_patches() if self.in_shapes.isChecked() else (),
         )
 
     def _near_by_limb(self) -> bool:
@@ -273,6 +281,11 @@ class ContactsDialog(Dialog):
         if not rules.touching and proposed is not None:
             rules = proposed.rules
         return rules.touching, rules.touching_radius
+
+    def _shape_patches(self) -> tuple[tuple[int, int], ...]:
+        """Return the patches that a morph target brings into contact."""
+        model = self._document.model
+        return model.rules.shape_touching or model.own_rules.shape_touching
 
     def _where_kept(self) -> str:
         """Return where changes are stored, or why none are possible; "" if in the model's file."""
@@ -296,6 +309,9 @@ class ContactsDialog(Dialog):
         self.at_rest.setChecked(rules.rest_exclusion is not None)
         self.at_joints.setChecked(rules.joint_exclusion)
         self.always.setChecked(bool(rules.touching))
+        self.in_shapes.setChecked(bool(rules.shape_touching))
+        for widget in (self.in_shapes, self.counts["shape"]):
+            widget.setVisible(bool(self._shape_patches()))
         rest = rules.rest_exclusion
         self.rest.setValue(_DEFAULT_REST if rest is None else _PERCENT * rest)
         self.tolerated.setValue(_PERCENT * rules.tolerated_depth)
@@ -347,6 +363,7 @@ class ContactsDialog(Dialog):
         can_change = not model.has_predictor
         for widget in (self.near, self.at_rest, self.tolerated, self.ignored, self.propose):
             widget.setEnabled(can_change)
+        self.in_shapes.setEnabled(can_change)
         self.rest.setEnabled(can_change and self.at_rest.isChecked())
         self.at_joints.setEnabled(can_change and model.has_joints)
         tip = "Pairs of parts linked by a joint, within a limb's thickness of it"

@@ -44,6 +44,7 @@ def test_collision_is_reported_with_its_energy(lcollision: Lcollision, stabbed: 
             "tolerated": 0,
             "joint": 0,
             "touching": 0,
+            "shape": 0,
         },
         "rules": ContactRules().to_json(),
         "rules_of": None,

@@ -16,7 +16,7 @@ from tests.app.support import Lcollision
 from tests.core.gltf_builder import arm, rotation, tube
 from tests.rigged_shapes import head_in_torso, rigged_body, write_gltf
 
-NONE = {"near": 0, "rest": 0, "ignored": 0, "tolerated": 0, "joint": 0, "touching": 0}
+NONE = {"near": 0, "rest": 0, "ignored": 0, "tolerated": 0, "joint": 0, "touching": 0, "shape": 0}
 
 
 @pytest.fixture

@@ -59,6 +59,7 @@ def test_report_of_a_good_set(
             "tolerated": 0,
             "joint": 0,
             "touching": 0,
+            "shape": 0,
         },
     }
     assert "1 pose intersects itself" in lcollision("dataset", "check", path).stdout

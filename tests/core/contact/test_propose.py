@@ -165,11 +165,10 @@ def test_patches_that_touch_in_nearly_every_pose_are_found_and_nothing_else() ->
     ruled = detector.with_rules(rules)
     assert ruled.are_colliding(poses).tolist() == [pose == 3 for pose in range(20)]
     # By independent code, each patch is in contact in 19 of 20 poses.
-    applied = IndependentRules(
-        mesh.vertices, mesh.faces, [], rules.to_json() | {"touching_radius": 0.1}, {}
-    )
+    applied = IndependentRules(mesh.vertices, mesh.faces, [], rules.to_json(), {})
+    radius = 0.1 * detector.body_size
     for pair in pairs:
-        one, two = (applied._faces_around(face, applied._patch_radius) for face in pair)
+        one, two = (applied._faces_around(face, radius) for face in pair)
         in_contact = [
             any((a in one and b in two) or (b in one and a in two) for a, b in found.pairs.tolist())
             for found in map(detector.detect, poses)

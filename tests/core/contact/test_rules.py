@@ -24,7 +24,7 @@ from tests.core.brute_force import all_pairs
 from tests.core.shapes import Mesh, grid, join, soup
 from tests.independent_check import IndependentRules
 
-RULES = ("near", "rest", "ignored", "tolerated", "joint", "touching")
+RULES = ("near", "rest", "ignored", "tolerated", "joint", "touching", "shape")
 
 FLOOR = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
 BLADE = [[1, 1, -1], [1, 1, 1], [2, 1, 1]]
@@ -87,6 +87,7 @@ def ruled_meshes(draw: st.DrawFn) -> tuple[Mesh, np.ndarray, ContactRules, tuple
         joint_exclusion=draw(st.booleans()),
         touching=tuple(map(tuple, rng.integers(len(mesh.faces), size=(3, 2)).tolist())),
         touching_radius=draw(st.sampled_from([0.0, 0.05, 0.31])),
+        shape_touching=tuple(map(tuple, rng.integers(len(mesh.faces), size=(3, 2)).tolist())),
         tolerated_pairs=tuple(
             draw(st.lists(st.tuples(names, names, st.sampled_from([0.0, 0.03, 0.1])), max_size=3))
         ),
@@ -112,7 +113,16 @@ def test_each_rule_is_the_first_for_some_pair() -> None:
     even = FaceGroup("even", np.arange(0, len(mesh.faces), 2))
     elbow = FaceGroup("elbow", np.arange(10, len(mesh.faces), 3), about_joint=True)
     touching = ((88, 51), (81, 32), (45, 30))
-    rules = ContactRules(0.2, 0.05, (("even", "even"),), 0.01, True, touching, 0.3)
+    rules = ContactRules(
+        0.2,
+        0.05,
+        (("even", "even"),),
+        0.01,
+        True,
+        touching,
+        0.3,
+        shape_touching=((29, 88),),
+    )
     found = check_by_the_text(rest, pose, rules, (even, elbow))
     assert found.colliding
     assert min(found.excluded.to_json().values()) > 0

@@ -12,7 +12,14 @@ from lcollision_core.errors import ShapeError
 from lcollision_core.meshes import ContactRules, RuleCounts
 
 ALL = ContactRules(
-    0.05, 0.0, (("Hair", "Body"), ("Belt", "Belt")), 1e-4, True, ((3, 0), (5, 9)), 0.02
+    0.05,
+    0.0,
+    (("Hair", "Body"), ("Belt", "Belt")),
+    1e-4,
+    True,
+    ((3, 0), (5, 9)),
+    0.02,
+    shape_touching=((2, 7),),
 )
 TOLERANT = ContactRules(tolerated_pairs=(("Belly", "Arm", 0.01), ("Belly", "Belly", 0.02)))
 
@@ -36,6 +43,7 @@ def test_what_a_file_lacks_is_off() -> None:
         ({"tolerated_depth": float("inf")}, "the tolerated depth must be 0 or more"),
         ({"ignored": (("Hair",),)}, "an ignored pair must be two names of groups"),
         ({"touching": ((3, -1),)}, "a touching pair must be two faces by number"),
+        ({"shape_touching": ((3,),)}, "a touching pair must be two faces by number"),
         ({"touching_radius": -1.0}, "the touching radius must be 0 or more"),
         ({"tolerated_pairs": (("Hair", "Body"),)}, "a tolerated pair must be two names of groups"),
         ({"tolerated_pairs": (("Hair", "Body", -0.1),)}, "and a depth of 0 or more, got"),
@@ -72,10 +80,11 @@ def test_damaged_json_is_refused_in_a_sentence(values: Any) -> None:
         (RuleCounts(rest=434), "434 pairs that touch at rest are not counted"),
         (RuleCounts(rest=1), "1 pair that touches at rest is not counted"),
         (
-            RuleCounts(2, 3, 4, 5, 6, 7),
+            RuleCounts(2, 3, 4, 5, 6, 7, 8),
             "2 pairs within 0.05 along the surface, 3 pairs that touch at rest, 4 pairs of Hair "
-            "and Body or Belt with itself, 5 pairs not deeper than 0.0001, 6 pairs at joints and 7 "
-            "pairs at places that nearly always touch are not counted",
+            "and Body or Belt with itself, 5 pairs not deeper than 0.0001, 6 pairs at joints, 7 "
+            "pairs at places that nearly always touch and 8 pairs at places that a shape brings "
+            "into contact are not counted",
         ),
     ],
 )
@@ -90,7 +99,7 @@ def test_what_is_not_looked_at_is_said_in_short() -> None:
     assert ContactRules(0.1, 0.02, joint_exclusion=True).summary() == (
         "near along the surface, touching at rest, at joints"
     )
-    assert ALL.summary().count(", ") == 5
+    assert ALL.summary().count(", ") == 6
 
 
 def test_depths_of_pairs_are_said_with_their_groups() -> None:
