@@ -302,6 +302,8 @@ class SceneBody(Body):
             everyone = np.arange(rows.start, rows.stop)
             groups.append(FaceGroup(name, everyone))
             for group in member.body.groups:
+                if member.is_rigid and len(group.faces) == len(everyone):
+                    continue  # The prop's name says it: not "sword: Sword".
                 pieces = group.name.split(", ", 1)
                 in_pieces = len(pieces) > 1 and own.issuperset(pieces)
                 label = (

@@ -185,6 +185,7 @@ def test_a_prop_elsewhere_comes_to_the_joint_that_holds_it(tmp_path: Path, folde
     sword = ScenePart(str(tmp_path / "sword.obj"), held_by="hero", joint="lefthand")
     body = body_of_scene(SceneFile((ScenePart(str(folder / "hero.glb")), sword)))
     assert np.allclose(body.reference[body.vertices_of["sword"]].mean(axis=0), [0.75, 1.45, 0.0])
+    assert [group.name for group in body.groups if "word" in group.name] == ["sword", "sword: grip"]
 
 
 def test_a_scene_file_is_found_again_with_its_bodies(folder: Path, tmp_path: Path) -> None:
