@@ -31,13 +31,15 @@ class StatusBar(QStatusBar):
         self._bar = QProgressBar(textVisible=False, maximum=1)
         self._bar.setFixedWidth(120)
         self._ring = Ring(_RING_SIDE)
-        self.cancel = described(QToolButton(), "Cancel the export")
-        self.cancel.setText("Cancel")
+        # The label beside it may name other work.
+        self.cancel = QToolButton(text="Cancel export")
         self._facts = labelled("", "caption")
         for widget in (self.busy, self._ring, self._bar, self.cancel, self._facts):
             self.addPermanentWidget(widget)
         self.setSizeGripEnabled(False)
         self.setContentsMargins(NORMAL, 0, NORMAL, 0)
+        # A long message is cut off.
+        self.messageChanged.connect(self.setToolTip)
         self.show_busy("")
 
     @Slot(str)

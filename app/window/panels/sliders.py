@@ -59,6 +59,9 @@ _FIELD_WIDTH, _ARROWS_WIDTH, _NARROW = 56, 22, 270
 """Widths of a number of seven characters, of its arrows, and of a row below which the arrows are
 hidden, in device-independent pixels."""
 
+_OF_HUNDRED = 4
+"""Further width of a number up to 100.0 %."""
+
 _BEYOND = 1.5
 """How far a typed number may be beyond either end of the slider's range, in widths of the range."""
 
@@ -214,8 +217,9 @@ class CodeRow(HoverRow):
         self._is_trained, self._is_shape = model.is_trained, is_shape
         # Factor and unit in which the field shows a code, such as degrees.
         self._shown, self._unit = float(space.shown[code]), space.units[code]
-        # Elide the middle: the end of a name says how the body part moves.
-        label = NameLabel(name, Qt.TextElideMode.ElideMiddle)
+        # The end of a name says how the body part moves; many shapes have the same start, too.
+        elide = Qt.TextElideMode.ElideLeft if is_shape else Qt.TextElideMode.ElideMiddle
+        label = NameLabel(name, elide)
         label.setMaximumWidth(name_width)
         self.slider = CodeSlider(
             low, high, float(space.shown[code]), model.card.domain_colours[moved]
@@ -230,7 +234,8 @@ class CodeRow(HoverRow):
         self.field.setObjectName("code")
         self.field.setSingleStep(self._shown * (high - low) / 100)
         self.field.setAlignment(Qt.AlignmentFlag.AlignRight)
-        self.field.setFixedWidth(_FIELD_WIDTH + _ARROWS_WIDTH)
+        self._field_width = _FIELD_WIDTH + (_OF_HUNDRED if is_shape else 0)
+        self.field.setFixedWidth(self._field_width + _ARROWS_WIDTH)
         source = f"motion {index + 1}"
         if not model.is_trained:
             source = next(g for g in space.groups if code < g.codes.stop).code_names[index]
@@ -265,7 +270,7 @@ class CodeRow(HoverRow):
         kinds = NumberBox.ButtonSymbols
         is_narrow = self.width() < _NARROW
         self.field.setButtonSymbols(kinds.NoButtons if is_narrow else kinds.UpDownArrows)
-        self.field.setFixedWidth(_FIELD_WIDTH + (0 if is_narrow else _ARROWS_WIDTH))
+        self.field.setFixedWidth(self._field_width + (0 if is_narrow else _ARROWS_WIDTH))
 
     def show_number(self, number: float) -> None:
         """Show a number of the document, even beyond the typing limits; a held handle stays."""
