@@ -260,7 +260,8 @@ class Ladder:
         if self.check.is_free(latent):
             return latent, Step.SOFT, sunk
         if found is not None:
-            note = f"no free pose was found within {100.0 * most:g} % of the body size"
+            kind = "pose with this clearance" if self.check.clearance > 0.0 else "free pose"
+            note = f"no {kind} was found within {100.0 * most:g} % of the body size"
         note = "; ".join(filter(None, (note, sunk))) or None
         is_same = np.array_equal(latent, self.problem.target)
         return latent, Step.NONE if is_same else Step.SOFT, note
