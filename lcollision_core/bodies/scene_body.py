@@ -301,8 +301,9 @@ class SceneBody(Body):
             own = {group.name for group in member.body.groups}
             everyone = np.arange(rows.start, rows.stop)
             groups.append(FaceGroup(name, everyone))
+            is_prop = member.holder is not None or (member.moves and not _bends(member.body))
             for group in member.body.groups:
-                if member.is_rigid and len(group.faces) == len(everyone):
+                if is_prop and len(group.faces) == len(everyone):
                     continue  # The prop's name says it: not "sword: Sword".
                 pieces = group.name.split(", ", 1)
                 in_pieces = len(pieces) > 1 and own.issuperset(pieces)
@@ -324,7 +325,6 @@ class SceneBody(Body):
                 (in_shapes, rules.shape_touching),
             ):
                 joined += [(a + rows.start, b + rows.start) for a, b in patches]
-            is_prop = member.holder is not None or (member.moves and not _bends(member.body))
             if is_prop and not member.is_fixed:
                 ignored.append((name, name))
             if member.holder is not None:
