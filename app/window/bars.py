@@ -32,7 +32,8 @@ class StatusBar(QStatusBar):
         self._bar.setFixedWidth(120)
         self._ring = Ring(_RING_SIDE)
         # The label beside it may name other work.
-        self.cancel = QToolButton(text="Cancel export")
+        self.cancel = QToolButton()
+        self.cancel.setText("Cancel export")
         self._facts = labelled("", "caption")
         for widget in (self.busy, self._ring, self._bar, self.cancel, self._facts):
             self.addPermanentWidget(widget)
