@@ -264,7 +264,9 @@ _SHAPE_SHARES = np.array([[0.25], [0.5], [0.75], [1.0]])
 
 
 def shape_patches(space: RigPoseSpace, detector: CollisionDetector) -> tuple[tuple[int, int], ...]:
-    """Find patches that a morph target alone brings into contact, such as closed lids and lashes.
+    """Find patches of a body part that a morph target brings into contact, such as lids and lashes.
+
+    Contact between parts counts, as joints can move these apart.
 
     Parameters
     ----------
@@ -290,7 +292,9 @@ def shape_patches(space: RigPoseSpace, detector: CollisionDetector) -> tuple[tup
             is_far = (highest < places.min(axis=0)) | (lowest > places.max(axis=0))
             near = detector.without(np.flatnonzero(is_far.any(axis=1)))
             touching += [near.detect(pose, counted_only=True).pairs for pose in poses]
-    return patches_about(detector, np.unique(np.concatenate(touching), axis=0), TOUCHING_RADIUS)
+    pairs = np.unique(np.concatenate(touching), axis=0)
+    parts = space.vertex_domain[detector.topology.faces[pairs][:, :, 0]]
+    return patches_about(detector, pairs[parts[:, 0] == parts[:, 1]], TOUCHING_RADIUS)
 
 
 _STEPS = 3
