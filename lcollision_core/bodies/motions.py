@@ -763,15 +763,12 @@ class _ClipsOfFile:
             left = [
                 at for at in frames if most is not None or not checks[at].is_free_mesh(shown[at])
             ]
-            return (
-                any(
-                    is_worse(checks[at], old, shown[at], most)
-                    for at, old in zip(
-                        left, self._shown(motion, left, self._unchanged), strict=True
-                    )
-                )
-                if left
-                else False
+            if not left:
+                return False
+            unchanged = self._shown(motion, left, self._unchanged)
+            return any(
+                is_worse(checks[at], old, shown[at], most)
+                for at, old in zip(left, unchanged, strict=True)
             )
 
         with ThreadPoolExecutor(available_cores(), "frames of a file") as pool:
