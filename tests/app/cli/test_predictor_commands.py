@@ -562,5 +562,5 @@ def test_describing_a_predictor_loads_no_torch(trained: Path, tmp_path: Path, co
         check=True,
     )
     *lines, torch_is_loaded = ended.stdout.splitlines()
-    assert any("predictor paper:" in line for line in lines)
+    assert any("predictor paper, of 1000 labelled" in line for line in lines)
     assert torch_is_loaded == "False"

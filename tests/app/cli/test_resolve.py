@@ -703,10 +703,10 @@ def test_benchmark_compares_the_solvers_with_bisection(
     rows = json.loads(result.stdout)
     assert [row["solver"] for row in rows] == ["bisection", "sqp", "auglag"]
     assert list(rows[0]) == [
-        *("solver", "poses", "median_ms", "p95_ms", "feasible_rate", "exactly_free_rate"),
-        *("free_before_walk_back", "energy_decrease", "latent_distance", "vertex_distance"),
-        *("largest_change", "overlap_left", "least_distance", "least_by_brute_force"),
-        "near_exclusion",
+        *("model", "near_exclusion", "solver", "poses", "median_ms", "p95_ms", "feasible_rate"),
+        *("exactly_free_rate", "free_before_walk_back", "energy_decrease", "latent_distance"),
+        *("vertex_distance", "largest_change", "overlap_left", "least_distance"),
+        "least_by_brute_force",
     ]
     for row in rows:
         assert row["poses"] == 6

@@ -540,8 +540,9 @@ def test_a_resolve_that_is_stopped_keeps_what_is_done(
     assert free(now.codes[changed]).all()
     n_left = int((~free(now.codes)).sum())
     n_before = int((~free(before.codes)).sum())
-    assert told[-1].startswith(f"Stopped: {n_before} frames collided; {n_left} still do")
-    assert 0 < n_left < n_before
+    left = f"{n_left} still do" if n_left else "all are free now"
+    assert told[-1].startswith(f"Stopped: {n_before} frames collided; {left}")
+    assert n_left < n_before
     window.document.history.undo()
     assert timeline.motion is before
 

@@ -12,6 +12,7 @@ from lcollision_core.bodies import open_body
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.bodies.scoring import check_poses
 from lcollision_core.contact import STRICT, CollisionDetector, ContactRules, gpu_search
+from lcollision_core.contact.kernels import N_KINDS
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.embedding.gpu_decoder import GpuDecoder
 from lcollision_core.errors import ShapeError
@@ -28,6 +29,7 @@ RULES = {
     "ignored": ContactRules(ignored=(("ball", "sheet"),)),
     "tolerated": ContactRules(tolerated_depth=0.02),
     "touching": ContactRules(touching=((12, 40),), touching_radius=0.4),
+    "shape": ContactRules(shape_touching=((12, 40),)),
 }
 ALL_RULES = ContactRules(
     0.3,
@@ -129,14 +131,14 @@ def test_auto_takes_a_gpu_for_what_is_worth_it_and_says_so(
 def test_candidates_that_overflow_are_found_again_and_what_is_refused_is_left() -> None:
     detector, poses = _bodies(STRICT, 3)
     search = detector.gpu_search()
-    counts = np.zeros((2, 3, 8), dtype=np.int64)
+    counts = np.zeros((2, 3, N_KINDS), dtype=np.int64)
     assert search.count(poses, counts[0]) == []
     search.candidate_capacity = 2
     assert search.count(poses, counts[1]) == []
     assert np.array_equal(counts[1], counts[0])
     assert search.candidate_capacity > 2
     poses[2, 1, 2] = np.nan
-    assert search.count(poses, np.zeros((3, 8), dtype=np.int64)) == [2]
+    assert search.count(poses, np.zeros((3, N_KINDS), dtype=np.int64)) == [2]
     choose_device(Device.CUDA)
     with pytest.raises(ShapeError, match="vertex 1 of pose 2 is not finite"):
         detector.are_colliding(poses)
@@ -151,7 +153,7 @@ def test_poses_with_too_many_candidates_are_checked_by_the_processor(
     monkeypatch.setattr(gpu_search, "MOST_BYTES", 8 * 105)
     search = detector.gpu_search()
     search.candidate_capacity = 30
-    assert 0 < len(search.count(poses, np.zeros((4, 8), dtype=np.int64))) < 4
+    assert 0 < len(search.count(poses, np.zeros((4, N_KINDS), dtype=np.int64))) < 4
     choose_device(Device.CUDA)
     found = detector.detect_batch(poses)
     assert np.array_equal(found.n_pairs, expected.n_pairs)
