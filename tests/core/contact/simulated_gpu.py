@@ -29,7 +29,7 @@ RULES = {
     "ignored": ContactRules(ignored=(("ball", "sheet"),)),
     "tolerated": ContactRules(tolerated_depth=0.02),
     "touching": ContactRules(touching=((12, 40),), touching_radius=0.4),
-    "shape": ContactRules(shape_touching=((12, 40),)),
+    "shape": ContactRules(shape_touching=((35, 50),)),
 }
 ALL_RULES = ContactRules(
     0.3,
