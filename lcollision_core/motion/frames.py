@@ -652,7 +652,7 @@ class Reason(StrEnum):
     NOT_FOUND = "no collision-free pose was found"
     BETWEEN = "resolving them makes in-between poses collide"
     AS_WRITTEN = "the file format can't store the correction"
-    STOPPED = "the budget ended before they were resolved"
+    STOPPED = "resolving was stopped before they were free"
 
 
 @dataclass(frozen=True)

@@ -411,7 +411,7 @@ def test_what_a_budget_leaves_undone_stays_as_it_was_and_is_named(
     assert row["deepest_after"] == pytest.approx(row["deepest_before"], rel=1e-5)
     (span,) = row["kept_spans"]
     assert span["unchanged"]
-    assert span["reason"] == "the budget ended before they were resolved"
+    assert span["reason"] == "resolving was stopped before they were free"
     out.unlink()
     result = lcollision("resolve", swing, *options, "--budget", 1000)
     assert result.exit_code == 0, result.output
