@@ -259,7 +259,7 @@ def default_rules(character: Character, groups: Sequence[FaceGroup] = ()) -> Con
     )
 
 
-_SHAPE_SHARES = np.array([[0.25], [0.5], [0.75], [1.0]])
+_SHAPE_SHARES = np.array([0.25, 0.5, 0.75, 1.0])
 """Shares of a morph target's range at which contact is looked for."""
 
 
@@ -283,7 +283,7 @@ def shape_patches(space: RigPoseSpace, detector: CollisionDetector) -> tuple[tup
     for end in (space.low, space.high):
         for shape in np.flatnonzero(space.are_shapes & (end != 0.0)):
             codes = np.zeros((len(_SHAPE_SHARES), len(end)))
-            codes[:, shape] = _SHAPE_SHARES[:, 0] * end[shape]
+            codes[:, shape] = _SHAPE_SHARES * end[shape]
             poses = (space.decode(codes) * space.body_size).astype(np.float32)
             moves = np.abs(poses[-1] - detector.reference).max(axis=1) > _SAME * detector.body_size
             if not moves.any():
@@ -292,9 +292,9 @@ def shape_patches(space: RigPoseSpace, detector: CollisionDetector) -> tuple[tup
             is_far = (highest < places.min(axis=0)) | (lowest > places.max(axis=0))
             near = detector.without(np.flatnonzero(is_far.any(axis=1)))
             touching += [near.detect(pose, counted_only=True).pairs for pose in poses]
-    pairs = np.unique(np.concatenate(touching), axis=0)
+    pairs = np.concatenate(touching)
     parts = space.vertex_domain[detector.topology.faces[pairs][:, :, 0]]
-    return patches_about(detector, pairs[parts[:, 0] == parts[:, 1]], TOUCHING_RADIUS)
+    return patches_about(detector, [pairs[parts[:, 0] == parts[:, 1]]], TOUCHING_RADIUS)
 
 
 _STEPS = 3
@@ -525,12 +525,7 @@ class RigBody(Body):
         )
         body = cls(character, space, card, poses)
         patches = shape_patches(space, body.detector) if space.n_shapes else ()
-        if not patches:
-            return body
-        rules = replace(card.rules, shape_touching=patches)
-        ruled = cls(character, space, replace(card, rules=rules), poses)
-        vars(ruled)["detector"] = body.detector.with_rules(rules, groups)
-        return ruled
+        return body.with_rules(replace(card.rules, shape_touching=patches)) if patches else body
 
     def with_roles(self, chosen: Mapping[str, str]) -> RigBody:
         """Return the character with other joint roles, and its default rules.

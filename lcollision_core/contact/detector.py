@@ -224,7 +224,7 @@ class CollisionDetector:
         self._idle: queue.LifoQueue[Searcher] = queue.LifoQueue()
         self._gpu: GpuSearch | None = None
         self._nearness: ClearanceRule | None = None
-        self._last_nearness: tuple[tuple[float, bool], ClearanceRule | None] = (0.0, False), None
+        self._last_nearness: tuple[tuple[float, bool], ClearanceRule] | None = None
         self._may_touch: TouchingGroups = ()
         self._path: LinearPath | None = None
 
@@ -264,9 +264,8 @@ class CollisionDetector:
         return other
 
     def _near(self, clearance: float, rest_is_known: bool) -> ClearanceRule:
-        wanted = clearance, rest_is_known
-        made_for, rule = self._last_nearness
-        if made_for != wanted or rule is None:
+        last = self._last_nearness
+        if last is None or last[0] != (clearance, rest_is_known):
             rule = nearness_of(
                 clearance,
                 self.topology,
@@ -276,8 +275,8 @@ class CollisionDetector:
                 rest_is_known=rest_is_known,
             )
             # Kept, as the frames of a motion ask for the same distance in turn.
-            self._last_nearness = wanted, rule
-        return rule
+            self._last_nearness = last = (clearance, rest_is_known), rule
+        return last[1]
 
     def without(self, faces: npt.NDArray[np.integer]) -> CollisionDetector:
         """Return a detector whose searches leave out some faces."""
@@ -296,7 +295,7 @@ class CollisionDetector:
         """Return a detector whose clearances let faces of two groups come to distance 0."""
         other = copy(self)
         other._may_touch, other._nearness = tuple(pairs), None
-        other._last_nearness = (0.0, False), None
+        other._last_nearness = None
         return other
 
     def with_rules(

@@ -88,6 +88,22 @@ def touching_patches(
         job.check()
         touching.append(detector.detect(pose, counted_only=True).pairs)
         job.report(done + 1, len(vertices))
+    return patches_about(detector, touching, radius, of_pieces=of_pieces)
+
+
+def patches_about(
+    detector: CollisionDetector,
+    touching: Sequence[npt.NDArray[np.int32]],
+    radius: float,
+    *,
+    of_pieces: bool = False,
+) -> tuple[tuple[int, int], ...]:
+    """Find patches that touch in nearly every pose; parameters are those of `touching_patches`.
+
+    Parameters
+    ----------
+    touching : the (n, 2) pairs of faces that touch in each pose
+    """
     patch_pairs, places = np.unique(np.concatenate(touching), axis=0, return_inverse=True)
     if not len(patch_pairs):
         return ()
@@ -99,29 +115,15 @@ def touching_patches(
         one_way = of_first[rows].T @ of_second[rows]
         n_poses_of += (one_way + one_way.T).astype(np.int32)
     often = sparse.triu(n_poses_of).tocoo()
-    is_frequent = often.data >= NEARLY_ALWAYS * len(vertices)
+    is_frequent = often.data >= NEARLY_ALWAYS * len(touching)
     patches = np.stack([often.row, often.col], axis=1)
     if of_pieces:
         are_made_so = _of_touching_pieces(detector, touching, middles[patches])
         centres = detector.reference[detector.topology.faces[middles]].mean(axis=1)
         away = np.linalg.norm(np.subtract(*centres[patches].transpose(1, 0, 2)), axis=1)
         are_made_so &= away <= _PIECES_NEAR * radius * detector.body_size
-        is_frequent |= are_made_so & (often.data >= _PIECES_PLACE * len(vertices))
+        is_frequent |= are_made_so & (often.data >= _PIECES_PLACE * len(touching))
     return _covering(of_first.tocsc(), of_second.tocsc(), patches[is_frequent], middles)
-
-
-def patches_about(
-    detector: CollisionDetector, pairs: npt.NDArray[np.int32], radius: float
-) -> tuple[tuple[int, int], ...]:
-    """Cover (n, 2) pairs of faces by pairs of patches, as `touching_patches` does."""
-    if not len(pairs):
-        return ()
-    middles, near = _patches(detector, np.unique(pairs), radius)
-    of_first, of_second = near[pairs[:, 0]], near[pairs[:, 1]]
-    one_way = of_first.T @ of_second
-    touching = sparse.triu(one_way + one_way.T).tocoo()
-    patches = np.stack([touching.row, touching.col], axis=1)
-    return _covering(of_first.tocsc(), of_second.tocsc(), patches, middles)
 
 
 def _of_touching_pieces(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -12,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import ShapeError
-from lcollision_core.jobs import available_cores
+from lcollision_core.jobs import for_blocks
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.contacts import KeptContacts
@@ -228,11 +227,14 @@ class Motion:
 
     def are_free(self, check: ExactCheck) -> npt.NDArray[np.bool_]:
         """Return (T,) whether each frame is free, checked on all cores."""
-        with ThreadPoolExecutor(available_cores(), "free frames") as pool:
-            verdicts = pool.map(
-                lambda frame: self.check(frame, check).is_free(self.codes[frame]), range(len(self))
-            )
-            return np.fromiter(verdicts, np.bool_, len(self))
+        free = np.empty(len(self), dtype=np.bool_)
+
+        def look(start: int, stop: int) -> None:
+            frames = range(start, stop)
+            free[start:stop] = [self.check(at, check).is_free(self.codes[at]) for at in frames]
+
+        for_blocks(look, len(self), 1)
+        return free
 
     def collide(
         self, frames: Sequence[int], check: ExactCheck, share: float = 0.0
