@@ -54,6 +54,8 @@ class Command:
     checked : returns whether it is ticked, for a toggle
     needs_body : whether it is disabled while no body is open
     in_view : whether its shortcut applies in the view and on the timeline only
+    follows_steps : whether any step of undo may change its state, not only the signals that all
+        commands follow
     """
 
     run: Callable[[EditorWindow], object]
@@ -67,6 +69,7 @@ class Command:
     checked: Callable[[EditorWindow], bool] | None = None
     needs_body: bool = True
     in_view: bool = False
+    follows_steps: bool = False
 
 
 Run = Callable[["EditorWindow"], object]
@@ -102,6 +105,11 @@ def without_body(run: Run | Command) -> Command:
 def in_view(run: Run | Command) -> Command:
     """Limit the shortcut of a command to the view and the timeline."""
     return replace(_command(run), in_view=True)
+
+
+def at_each_step(run: Run | Command) -> Command:
+    """Refresh a command after each step of undo, such as a slider's move."""
+    return replace(_command(run), follows_steps=True)
 
 
 def _command(run: Run | Command) -> Command:
@@ -248,18 +256,27 @@ class Commands(QObject):
             menu = self.menus[listed.title] = self._window.menuBar().addMenu(listed.title)
             self._fill(menu, listed)
 
-    def follow(self, signals: Iterable[SignalInstance]) -> None:
-        """Refresh all actions now and whenever one of these signals is emitted."""
+    def follow(self, signals: Iterable[SignalInstance], of_steps: Iterable[SignalInstance]) -> None:
+        """Refresh all actions now and on `signals`, and those `at_each_step` on `of_steps`."""
         for signal in signals:
             signal.connect(self.refresh)
+        for signal in of_steps:
+            signal.connect(self._on_step)
         self.refresh()
 
     @Slot()
     def refresh(self) -> None:
         """Disable unavailable actions, with the reason as tool tip; update texts and ticks."""
+        self._refresh(self.by_key.values())
+
+    @Slot()
+    def _on_step(self) -> None:
+        self._refresh(command for command in self.by_key.values() if command.follows_steps)
+
+    def _refresh(self, commands: Iterable[Command]) -> None:
         has_body = self._window.document.has_model
-        for key, command in self.by_key.items():
-            action = self.actions[key]
+        for command in commands:
+            key, action = command.key, self.actions[command.key]
             reason = NO_BODY if command.needs_body and not has_body else ""
             if not reason and command.why_not is not None:
                 reason = command.why_not(self._window)

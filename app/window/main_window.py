@@ -231,8 +231,8 @@ class MainWindow(EditorWindow):
         self.commands.follow(
             (
                 *(document.model_changed, document.library.changed, motion.locks_changed),
-                *(history.undo_stack.indexChanged, history.file_changed, history.pins_changed),
-                *(history.file_poses_changed, history.ghost_changed, motion.solid_changed),
+                *(history.pins_changed, history.file_poses_changed, history.ghost_changed),
+                motion.solid_changed,
                 *(tasks.solve_started, tasks.solve_finished, tasks.busy_changed),
                 *(self.viewport.pointed, self.viewport.shading_changed),
                 *(self.viewport.pictures.busy_changed, self.library.chosen_changed),
@@ -240,7 +240,8 @@ class MainWindow(EditorWindow):
                 *(document.timeline.opened, document.timeline.playback.changed),
                 *(document.timeline.options_changed, document.timeline.onion_changed),
                 *(document.timeline.trail_changed, history.moment_entered),
-            )
+            ),
+            of_steps=(history.undo_stack.indexChanged, history.file_changed),
         )
 
     # Following the document.

@@ -13,7 +13,7 @@ from PySide6.QtGui import QGuiApplication
 
 from app.editing.live_pose import part_name
 from app.view.shading import Shading
-from app.window.command import EditorWindow, Menu, called, greyed, unless
+from app.window.command import EditorWindow, Menu, at_each_step, called, greyed, unless
 from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.contact_rules import ContactsDialog
 from lcollision_core.errors import LCollisionError
@@ -158,6 +158,7 @@ def _with_step(text: str, step: str) -> str:
 
 @EDIT.command("undo", "&Undo", "Ctrl+Z", "Undo the last change", "undo")
 @unless(lambda w: w.document.history.undo_stack.canUndo(), "There is nothing to undo")
+@at_each_step
 @called(lambda w: _with_step("&Undo", w.document.history.undo_stack.undoText()))
 def _undo(window: EditorWindow) -> None:
     window.document.history.undo()
@@ -165,6 +166,7 @@ def _undo(window: EditorWindow) -> None:
 
 @EDIT.command("redo", "&Redo", "Ctrl+Shift+Z, Ctrl+Y", "Redo the change that was undone", "redo")
 @unless(lambda w: w.document.history.undo_stack.canRedo(), "There is nothing to redo")
+@at_each_step
 @called(lambda w: _with_step("&Redo", w.document.history.undo_stack.redoText()))
 def _redo(window: EditorWindow) -> None:
     window.document.history.redo()

@@ -13,7 +13,7 @@ from PySide6.QtCore import Qt
 from app.editing.history import Source
 from app.editing.library import retagged
 from app.editing.tasks import Work
-from app.window.command import EditorWindow, Menu, called, greyed, unless
+from app.window.command import EditorWindow, Menu, at_each_step, called, greyed, unless
 from app.window.dialogs.forms import MotionDialog, run_form
 from app.window.dialogs.questions import ask_for_name, ask_to_replace
 from app.work.threads import as_task
@@ -227,6 +227,7 @@ def _keep(window: EditorWindow) -> None:
 
 @LIBRARY.command("update", "&Update pose", "Ctrl+U", "Replace the library's pose with this one")
 @greyed(_why_not_updated)
+@at_each_step
 @called(_update_text)
 def _update(window: EditorWindow) -> None:
     window.document.library.update_pose()

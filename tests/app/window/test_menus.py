@@ -162,3 +162,40 @@ def test_the_focus_is_seen_on_what_is_chosen(qtbot: QtBot, window: MainWindow) -
     take_picture(window, "focused pose")
     assert window.viewport.canvas.accessibleName()
     rest(qtbot, window)
+
+
+def test_every_action_is_up_to_date_after_each_step(qtbot: QtBot, window: MainWindow) -> None:
+    """Steps of undo refresh only some commands; the others must not depend on them."""
+    document, commands = window.document, window.commands
+    motion, library = document.motion, document.library
+
+    def states() -> dict[str, tuple[object, ...]]:
+        return {
+            key: (action.text(), action.toolTip(), action.isEnabled(), action.isChecked())
+            for key, action in commands.actions.items()
+        }
+
+    texts = {commands.actions["undo"].text()}
+    for act in (
+        lambda: motion.set_code(0, 0.3),
+        lambda: document.pins.pin([motion.grip_at(0)]),
+        lambda: library.add_pose("kept"),
+        lambda: motion.set_code(1, 0.2),
+        document.history.undo,
+        document.history.redo,
+        lambda: library.update_pose(),
+        lambda: library.rename_pose("kept", "renamed"),
+        lambda: motion.set_locked(0, True),
+        lambda: motion.load_pose(library.poses[0]),
+        lambda: motion.randomise(1.0, 3),
+        lambda: library.remove_poses(["renamed"]),
+        motion.reset_all,
+        document.new_pose,
+    ):
+        act()
+        rest(qtbot, window)
+        before = states()
+        commands.refresh()
+        assert states() == before
+        texts.add(commands.actions["undo"].text())
+    assert len(texts) > 8
