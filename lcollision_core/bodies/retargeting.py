@@ -685,8 +685,10 @@ def skeleton_notes(body: Body, path: Path) -> tuple[str, ...]:
     rested = Retargeting.of(motion, rig_space_of(body, path), path).motion
     if rested.turns_y_up:
         return (*notes, f"{path.name} stands along y at rest and along z in its frames: z is up")
-    if rested.up.min() < 0.0:
-        return (*notes, f"{path.name} stands along -y: y is down")
+    if rested.up[0] or rested.up.min() < 0.0:
+        axis = int(np.abs(rested.up).argmax())
+        sign = "-" if rested.up[axis] < 0.0 else ""
+        return (*notes, f"{path.name} stands along {sign}{'xyz'[axis]}, taken as up")
     if rested.frame is None:
         return notes
     at = f"frame {rested.frame} (from 0)"

@@ -9,7 +9,7 @@ orientation. It becomes the rest pose; the frames' poses do not change.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -78,7 +78,7 @@ class ReposedMotion:
     ----------
     stored : the skeleton as in its file
     rest_turns : (J, 3, 3) world rotations of its joints in the new rest pose
-    up : (3,) unit vector, an axis; -y in files with the axes of pictures
+    up : (3,) unit vector, an axis, y or z in most files
     front : (3,) unit vector, an axis; None to take it from the file's own rest pose
     frame : the frame that the rest pose was taken from; None for the file's own
     """
@@ -227,17 +227,14 @@ def with_standing_rest(motion: SkeletonMotion) -> ReposedMotion:
         )
     if marks is None:
         return as_stored
-    stands = marks == of_rest
-    mean = marks.trunk(places).mean(axis=0)
+    way, mean = marks.trunk(rest), marks.trunk(places).mean(axis=0)
     up = np.eye(3)[2 if mean[2] > max(mean[1], _UPRIGHT) else 1]
-    own_way = marks.trunk(rest)
-    if stands and own_way[1] < -_UPRIGHT and mean[1] < -_UPRIGHT:
-        return ReposedMotion(motion, own_turns, -up)
-    is_level = mean @ up < _UPRIGHT
-    if stands and own_way[1] > _UPRIGHT and _stands_on_z(marks, rest, places):
-        return ReposedMotion(motion, np.broadcast_to(_TO_Z_UP, own_turns.shape), up)
-    if stands and (own_way[1] > _UPRIGHT or own_way @ up > _UPRIGHT or is_level):
-        return as_stored
+    if marks == of_rest:
+        if way[1] > _UPRIGHT and _stands_on_z(marks, rest, places):
+            return ReposedMotion(motion, np.broadcast_to(_TO_Z_UP, own_turns.shape), up)
+        if max(way[1], way @ up) > _UPRIGHT or mean @ up < _UPRIGHT:
+            axis = int(np.abs(way).argmax())
+            return replace(as_stored, up=np.sign(way[axis]) * np.eye(3)[axis])
     best = int(np.argmax([_likeness(marks, shown, up) for shown in places]))
     if not marks.stand(places[best]):
         return as_stored

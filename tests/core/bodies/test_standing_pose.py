@@ -104,15 +104,19 @@ def limbs_of(stored: Stored) -> FloatArray:
     return units / np.linalg.norm(units, axis=2, keepdims=True)
 
 
-Y_DOWN = np.diag([1.0, -1.0, -1.0])
-"""As in pictures, from which motions are estimated."""
+TURNED = {
+    "y down": np.diag([1.0, -1.0, -1.0]),
+    "x up": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    "z down": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+}
+"""Rotations from y up to the axes of a whole file; y is down in pictures."""
 
 
 def axes_of(kind: str, rng: np.random.Generator) -> FloatArray:
     if kind in ("standing", "z up in its frames"):
         return np.broadcast_to(np.eye(3), (len(NAMES), 3, 3))
-    if kind == "y down":
-        return np.broadcast_to(Y_DOWN, (len(NAMES), 3, 3))
+    if kind in TURNED:
+        return np.broadcast_to(TURNED[kind].T, (len(NAMES), 3, 3))
     if kind == "lying":
         lying = Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
         return np.broadcast_to(lying, (len(NAMES), 3, 3))
@@ -121,7 +125,7 @@ def axes_of(kind: str, rng: np.random.Generator) -> FloatArray:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
-    "kind", ["any", "lying", "standing", "without names", "y down", "z up in its frames"]
+    "kind", ["any", "lying", "standing", "without names", "z up in its frames", *TURNED]
 )
 def test_limbs_point_as_they_are_shown_whatever_the_rest_pose(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -134,10 +138,11 @@ def test_limbs_point_as_they_are_shown_whatever_the_rest_pose(kind: str, seed: i
     if kind == "z up in its frames":
         z_up = Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
         stored = replace(stored, world=z_up @ stored.world, roots=stored.roots @ z_up.T)
-    if kind == "y down":
-        stored = replace(stored, world=Y_DOWN @ stored.world, roots=stored.roots @ Y_DOWN.T)
+    if kind in TURNED:
+        turn = TURNED[kind]
+        stored = replace(stored, world=turn @ stored.world, roots=stored.roots @ turn.T)
     retargeting = Retargeting.of(stored, body.space, Path("capture.bvh"))
-    as_stored = ("standing", "y down", "z up in its frames")
+    as_stored = ("standing", "z up in its frames", *TURNED)
     assert (retargeting.motion.frame is None) == (kind in as_stored)
     transforms = retargeting.transforms()
     places = transforms[..., :3, 3] @ TO_Y_UP.T
