@@ -26,6 +26,7 @@ from app.cli.shared_options import (
     NoRulesOption,
     RestOption,
     TouchOption,
+    touch_entries,
 )
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
@@ -118,7 +119,7 @@ def check(
         rest,
         no_rules,
         clearance,
-        tuple(touch or ()),
+        touch_entries(touch, clearance),
         choice,
         body,
         error_bound,

@@ -30,6 +30,7 @@ from app.cli.shared_options import (
     PosesOutput,
     ScaleOption,
     TouchOption,
+    touch_entries,
 )
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.jobs import Job
@@ -139,7 +140,8 @@ def sample(
 
     choose_device(device, note)
     destination = require_output(output, ".json")
-    model = open_scene(model_name, scene).with_options(rules).with_touching(touch or ())
+    may_touch = touch_entries(touch, clearance)
+    model = open_scene(model_name, scene).with_options(rules).with_touching(may_touch)
     for remark in model.notes:
         note(remark)
     with progress_bar("Drawing poses") as job:

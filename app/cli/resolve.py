@@ -32,6 +32,7 @@ from app.cli.shared_options import (
     ScaleOption,
     ThreadsOption,
     TouchOption,
+    touch_entries,
 )
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
@@ -211,13 +212,14 @@ def resolve(
         )
     else:
         refuse_given(context, _OF_MOTIONS, "needs --motion", "add that, or leave it out")
+    may_touch = touch_entries(touch, options.clearance or float(for_cloth))
     choose_device(device, note)
     model = open_scene(model_name, scene)
     if joints is not None:
         if scheduler:
             refuse_given(context, ("joints",), "is for motions resolved here", "leave it out")
         model = with_joint_map(model, joints)
-    model = model.with_options(rules).with_touching(touch or ())
+    model = model.with_options(rules).with_touching(may_touch)
     options = replace(
         options,
         locked_domains=frozenset(_domain(model, name) for name in lock or ()) | model.fixed_domains,
@@ -239,7 +241,7 @@ def resolve(
             continuous=choice.continuous,
             feet=frozenset(_domain(model, name) for name in foot or ()),
         )
-        remote = Remote(scheduler, model_name, tuple(touch or ())) if scheduler else None
+        remote = Remote(scheduler, model_name, may_touch) if scheduler else None
         of_motions = ResolveMotionsRequest(
             model, inputs or (), target, of_motion, choice, workers, remote, only_check=only_check
         )

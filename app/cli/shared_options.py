@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from lcollision_core.devices import Device
+from lcollision_core.errors import LCollisionError
 
 Axis = Literal["x", "y", "z"]
 
@@ -140,3 +141,15 @@ InPlaceOption = Annotated[
     bool,
     typer.Option("--in-place", help="Let the output replace a file that the command reads."),
 ]
+
+
+def touch_entries(touch: list[str] | None, clearance: float) -> tuple[str, ...]:
+    """Return the entries of --touch.
+
+    Raises
+    ------
+    LCollisionError : there are some, and no clearance.
+    """
+    if touch and clearance == 0.0:
+        raise LCollisionError("--touch needs --clearance", "add that, or leave it out")
+    return tuple(touch or ())

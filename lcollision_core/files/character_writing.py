@@ -33,7 +33,14 @@ from lcollision_core.files.gltf.schema import PARTS, VERTEX_DATA, GltfDocument, 
 from lcollision_core.files.mesh.polygons import MAX_FILE_BYTES
 from lcollision_core.files.safe import atomic_write, make_unique, read_regular
 from lcollision_core.files.scene.joined import join_parts
-from lcollision_core.files.scene.scene import Primitive, ScenePoses, by_node, parents_first
+from lcollision_core.files.scene.scene import (
+    KEYS_ARE_FRAMES,
+    LEAST_RATE,
+    Primitive,
+    ScenePoses,
+    by_node,
+    parents_first,
+)
 from lcollision_core.files.scene.transforms import compose, decompose, signs_on_one_side
 from lcollision_core.files.scene_files import SceneDocument, as_file_error, scene_of
 from lcollision_core.files.table import GLTF_SUFFIXES
@@ -571,6 +578,8 @@ class _Source:
         seconds = np.arange(len(transforms)) / clip.fps
         times = self.patch.add_array(seconds[:, None], has_bounds=True)
         animation: dict[str, Any] = {"name": name, "samplers": [], "channels": []}
+        if clip.fps < LEAST_RATE:
+            animation["extras"] = {KEYS_ARE_FRAMES: True}
         for number, tracks in keys.items():
             node = self._nodes[number]
             for part, stored, values in zip(PARTS, stored_parts(node), tracks, strict=True):

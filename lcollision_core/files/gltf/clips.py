@@ -17,12 +17,13 @@ from lcollision_core.files.gltf.schema import (
     GltfDocument,
     as_float,
     extension_of,
+    inner,
     require_element,
     require_int,
     stored_parts,
 )
 from lcollision_core.files.safe import make_unique
-from lcollision_core.files.scene.scene import Clip, Part, ScenePoses
+from lcollision_core.files.scene.scene import KEYS_ARE_FRAMES, Clip, Part, ScenePoses
 from lcollision_core.files.scene.transforms import (
     compose,
     global_transforms,
@@ -392,7 +393,8 @@ def read_clips(
                 part_nodes,
                 default_weights,
             )
-            clips.append(Clip(name, sample.moved, sample.key_times, sample))
+            is_baked = inner(animation, "extras").get(KEYS_ARE_FRAMES) is True
+            clips.append(Clip(name, sample.moved, sample.key_times, sample, is_baked))
     return tuple(clips)
 
 

@@ -24,6 +24,9 @@ MOST_KEYS_PER_SECOND = 30.0
 LEAST_RATE = 20.0
 """Keys per second below which a clip is assumed to move between its keys."""
 
+KEYS_ARE_FRAMES = "keysAreFrames"
+"""Name in a glTF animation's extras that marks the keys of a motion with fewer frames."""
+
 _LEAST_STEP = 1e-3
 """Shortest time between keys, in seconds, that counts as a step."""
 
@@ -36,8 +39,8 @@ _NAMED = 3
 
 NO_MESH = (
     "it contains an animation, but no mesh",
-    "name or open the character that it is to move, or export it with its mesh (on some sites: "
-    "with skin)",
+    "name or open the character that it is to move (in commands also --motion or --clips), or "
+    "export it with its mesh (on some sites: with skin)",
 )
 """Problem and advice for a file with only an animation when a mesh is needed."""
 
@@ -142,12 +145,14 @@ class Clip:
     moved : the nodes that it moves, without those that follow them
     read_key_times : returns `key_times`, and may read the file's arrays
     sample : returns the N poses at (N,) times
+    keys_are_frames : whether it is known not to move between its keys, however few they are
     """
 
     name: str
     moved: frozenset[int]
     read_key_times: Callable[[], FloatArray]
     sample: Callable[[FloatArray], ScenePoses]
+    keys_are_frames: bool = False
 
     @cached_property
     def key_times(self) -> FloatArray:
@@ -163,8 +168,8 @@ class Clip:
     def rate(self) -> float:
         """Keys per second, from the median step between them.
 
-        A clip with fewer than `LEAST_RATE` keys per second moves between them, so its rate is
-        `MOST_KEYS_PER_SECOND`.
+        A clip with fewer than `LEAST_RATE` keys per second is assumed to move between them, so its
+        rate is `MOST_KEYS_PER_SECOND`.
         """
         steps = np.diff(self.key_times)
         steps = steps[steps > _LEAST_STEP]
@@ -175,7 +180,8 @@ class Clip:
         rate = 1.0 / float(alike.mean()) if len(alike) else 0.0
         nearest = float(round(rate))
         rate = nearest if abs(rate - nearest) < 1e-4 * rate else rate
-        return rate if rate >= LEAST_RATE else MOST_KEYS_PER_SECOND
+        are_frames = rate >= LEAST_RATE or (self.keys_are_frames and rate > 0.0)
+        return rate if are_frames else MOST_KEYS_PER_SECOND
 
     def times(self, fps: float | None) -> FloatArray:
         """Return the times of the clip's frames.

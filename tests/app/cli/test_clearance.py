@@ -78,6 +78,10 @@ def test_groups_that_may_touch_are_named(lcollision: Lcollision, tmp_path: Path)
     refused = lcollision("check", path, "--clearance", "0.05", "--touch", "component 1:leg")
     assert refused.exit_code == 2
     assert "the pair that may touch 'component 1:leg' names 'leg'" in refused.stderr
+    for command in (["check", path], ["sample", "body", "-n", "1", "-o", tmp_path / "p.json"]):
+        refused = lcollision(*command, "--touch", names[0])
+        assert refused.exit_code == 2
+        assert "--touch needs --clearance; add that, or leave it out" in refused.stderr
 
 
 def test_parts_of_a_body_that_may_touch_come_nearer(lcollision: Lcollision, tmp_path: Path) -> None:

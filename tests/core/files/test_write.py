@@ -555,7 +555,9 @@ def test_a_clip_of_a_rig_that_is_scaled_unevenly_is_held_by_its_joints(tmp_path:
     vertices = space.decode(codes) * space.body_size
     transforms = np.stack([space.transforms(one) for one in codes])
     frames = write_character_clip(path, character, vertices, transforms, fps=10.0)
-    again = read_character(path).sample("poses", None).vertices
+    reread = read_character(path)
+    assert reread.rate("poses") == 10.0
+    again = reread.sample("poses", None).vertices
     for wanted, frame, held in zip(vertices, frames, again, strict=True):
         assert np.abs(frame.vertices - wanted).max() < 1e-5 * space.body_size
         assert np.abs(held - frame.vertices).max() < 1e-6 * space.body_size
