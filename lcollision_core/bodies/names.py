@@ -16,6 +16,9 @@ from lcollision_core.files.safe import make_unique
 from lcollision_core.meshes.topology import FloatArray
 
 MAX_NAME_LENGTH = 60
+BETWEEN_BODIES = " + "
+"""Joins the names of a scene's bodies."""
+
 MAX_POSE_NAME_LENGTH = 200
 
 _MAIN_SHARE = 0.6

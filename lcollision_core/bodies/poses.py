@@ -24,7 +24,7 @@ from msgspec.structs import astuple
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.learned_body import ListedModel, find_latent_space, user_models_folder
 from lcollision_core.bodies.mirror import MirroredPose, MirrorSource, Symmetry, pose_bytes
-from lcollision_core.bodies.names import MAX_POSE_NAME_LENGTH, unique_names
+from lcollision_core.bodies.names import BETWEEN_BODIES, MAX_POSE_NAME_LENGTH, unique_names
 from lcollision_core.bodies.remembered import find_character
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.files import (
@@ -342,6 +342,9 @@ def _other_model(
             f"{_difference(owner, model)}"
         )
         next_step = "use them with the model that they were made with"
+    elif BETWEEN_BODIES in name:
+        what = f"contains poses of the scene {name!r}, not of {model.name!r}"
+        next_step = "name the scene's file, or its other bodies by --with"
     else:
         what = (
             f"contains poses of the model {name!r}, not of {model.name!r}, and {name!r} is not "

@@ -16,6 +16,7 @@ from msgspec import Meta
 from lcollision_core.bodies.body import Body, ModelCard, read_only
 from lcollision_core.bodies.mirror import PoseMirror, Symmetry
 from lcollision_core.bodies.names import (
+    BETWEEN_BODIES,
     MAX_NAME_LENGTH,
     SHAPES,
     WHOLE_BODY,
@@ -173,7 +174,7 @@ class SceneBody(Body):
         )
         space = self._space
         super().__init__(
-            name or " + ".join(member.name for member in members if not member.is_ground)[:200],
+            name or BETWEEN_BODIES.join(own.name for own in members if not own.is_ground)[:200],
             card,
             space.topology,
             space.rest_vertices * self._size,

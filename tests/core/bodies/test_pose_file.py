@@ -128,11 +128,13 @@ def test_poses_of_another_model_name_it_and_never_its_fingerprint(
     )
     assert caught.value.model == ListedModel("snake", folder / "snake.safetensors", False)
     (folder / "snake.safetensors").unlink()
-    for name in ("tube", "body"):
+    scene = "of the scene 'hero [+] villain', not of 'body'; name the scene's file, or its other"
+    missing = "not among your models"
+    for name, why in (("tube", missing), ("body", missing), ("hero + villain", scene)):
         document = json.loads(path.read_text())
         document["model"]["name"] = name
         path.write_text(json.dumps(document))
-        with pytest.raises(OtherModelError, match="not among your models") as caught:
+        with pytest.raises(OtherModelError, match=why) as caught:
             read_poses(path, body)
         assert caught.value.model is None
         assert f"{name!r}" in str(caught.value)
