@@ -85,11 +85,14 @@ def check(
 ) -> None:
     """Find the exact self-collisions of any triangle mesh.
 
-    A pose of a character that was exported from here, or that was opened before, is checked by
-    that character's contact rules. With --clips, motions are checked: the clips of characters and
-    other animated files, point caches with their mesh beside them, and, with --body, BVH and VRMA
-    files, poses, and .npz files of SMPL, SMPL-H and SMPL-X (as of AMASS), whose body is the .npz
-    file of that model. Exits with 0 if no mesh has collisions, with 1 if any has.
+    A file that was exported from here, or that has the faces of a character that was opened before,
+    is checked by that character's contact rules; the character's own file only by rules that were
+    chosen for it, so that what touches in its stored pose counts.
+
+    With --clips, motions are checked: the clips of characters and other animated files, point
+    caches with their mesh beside them, and, with --body, BVH and VRMA files, poses, and .npz files
+    of SMPL, SMPL-H and SMPL-X (as of AMASS), whose body is the .npz file of that model. Exits with
+    0 if no mesh has collisions, with 1 if any has.
 
     With --clearance, faces collide as soon as they are nearer than that. Without a rest pose, faces
     joined by an edge, or by at most four clearances along the surface, count only if they

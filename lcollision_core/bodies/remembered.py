@@ -189,8 +189,9 @@ def with_remembered(model: RigBody) -> RigBody:
 def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigBody, FloatArray] | None:
     """Return the character whose pose a mesh file holds, with its rules, and that pose.
 
-    The file is one that a character was exported to, with its rules; the file of a character
-    opened before; or a mesh with the same faces in the same order as such a character.
+    The file is one that a character was exported to, with its rules; the file of a character for
+    which rules were chosen; or a mesh with the same faces in the same order as a character opened
+    before, as a note says.
 
     Parameters
     ----------
@@ -217,13 +218,15 @@ def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigBody, FloatArray] | No
     if document is not None and document.has_skin:
         body = open_character(document, clips=False)
         if known_character(body.fingerprint) is not None and mesh.topology == body.topology:
-            return body, mesh.vertices
+            # Whatever touches in its stored pose would not count by the usual rules.
+            return (body, mesh.vertices) if body.rules_are_chosen else None
     digest = _digest(mesh.topology)
     for file in sorted(user_characters_folder().glob("*.json")):
         entry = _readable_character(file.stem)
         if entry is not None and entry.mesh == digest and Path(entry.file).is_file():
             body = open_character(entry.file, clips=False)
             if body.topology == mesh.topology:
+                body = body.noted(f"it has the faces of {entry.file}, which was opened before")
                 return body, mesh.vertices * _unit_of(mesh.vertices, body)
     return None
 

@@ -110,6 +110,8 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
     try:
         if character is not None:
             body, vertices = character
+            for remark in body.notes:
+                job.note(f"{path}: {remark}")
         else:
             vertices, groups = mesh.vertices, _groups(path, mesh.topology, request)
             reference = vertices if rest is None else rest.vertices

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import NamedPose, open_body, write_poses
+from lcollision_core.bodies.remembered import remember_file
 from lcollision_core.files import read_own_file, write_mesh
 from lcollision_core.files.scene_files import open_scene
 from lcollision_core.meshes import ContactRules
@@ -343,8 +344,10 @@ def test_a_mesh_of_a_character_that_was_opened_is_checked_by_its_rules(
     out = tmp_path / name
     if name != "hero.glb":
         exported(name, "--axes", "unreal")
-    (report,) = json.loads(lcollision("check", "--json", out).stdout)
+    result = lcollision("check", "--json", out)
+    (report,) = json.loads(result.stdout)
     assert (report["colliding"], report["rules_of"]) == (False, "hero")
+    assert f"{out}: its contact rules are those that you chose for it" in result.stderr
     # Its energies are in its own unit, whatever the file's unit.
     depth = lcollision("check", "--json", out, "--tolerated-depth", 0.5)
     assert json.loads(depth.stdout)[0]["rules"]["tolerated_depth"] == 0.5
@@ -352,6 +355,19 @@ def test_a_mesh_of_a_character_that_was_opened_is_checked_by_its_rules(
     result = lcollision("check", "--json", out)
     assert result.exit_code == 1
     assert json.loads(result.stdout)[0]["rules_of"] is None
+
+
+def test_opening_a_character_does_not_change_what_is_found_in_its_file(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    hero = write_gltf(head_in_torso(), tmp_path / "hero.glb")
+    reports = []
+    for _ in range(2):
+        (report,) = json.loads(lcollision("check", "--json", hero).stdout)
+        reports.append(report | {"seconds": 0.0})
+        remember_file(open_body(hero), hero)
+    assert reports[0] == reports[1]
+    assert reports[0]["colliding"]
 
 
 def _edited(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
