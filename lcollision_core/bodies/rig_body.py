@@ -259,7 +259,7 @@ def default_rules(character: Character, groups: Sequence[FaceGroup] = ()) -> Con
     )
 
 
-_SHAPE_SHARES = np.array([0.25, 0.5, 0.75, 1.0])
+_SHAPE_SHARES = (0.25, 0.5, 0.75, 1.0)
 """Shares of a morph target's range at which contact is looked for."""
 
 
@@ -277,23 +277,27 @@ def shape_patches(space: RigPoseSpace, detector: CollisionDetector) -> tuple[tup
     -------
     pairs of faces in the middle of two patches, for `ContactRules.shape_touching`
     """
-    corners = detector.reference[detector.topology.faces]
-    lowest, highest = corners.min(axis=1), corners.max(axis=1)
+    reference, faces = detector.reference, detector.topology.faces
+    lowest, highest = (edge(reference[faces], axis=1).T.copy() for edge in (np.min, np.max))
     touching = [np.empty((0, 2), dtype=np.int32)]
     for end in (space.low, space.high):
         for shape in np.flatnonzero(space.are_shapes & (end != 0.0)):
-            codes = np.zeros((len(_SHAPE_SHARES), len(end)))
-            codes[:, shape] = _SHAPE_SHARES * end[shape]
-            poses = (space.decode(codes) * space.body_size).astype(np.float32)
-            moves = np.abs(poses[-1] - detector.reference).max(axis=1) > _SAME * detector.body_size
-            if not moves.any():
+            codes = np.zeros((1, len(end)))
+            codes[0, shape] = end[shape]
+            change = space.decode(codes)[0] * space.body_size - reference
+            moves = np.unique(np.flatnonzero(np.abs(change) > _SAME * detector.body_size) // 3)
+            if not len(moves):
                 continue
-            places = np.concatenate([poses[-1, moves], detector.reference[moves]])
-            is_far = (highest < places.min(axis=0)) | (lowest > places.max(axis=0))
-            near = detector.without(np.flatnonzero(is_far.any(axis=1)))
-            touching += [near.detect(pose, counted_only=True).pairs for pose in poses]
+            places = np.concatenate([reference[moves] + change[moves], reference[moves]])
+            is_far = np.zeros(len(faces), dtype=np.bool_)
+            for axis, (low, high) in enumerate(zip(places.min(0), places.max(0), strict=True)):
+                is_far |= (highest[axis] < low) | (lowest[axis] > high)
+            near = detector.without(is_far)
+            for share in _SHAPE_SHARES:
+                pose = (reference + share * change).astype(np.float32)
+                touching.append(near.detect(pose, counted_only=True).pairs)
     pairs = np.concatenate(touching)
-    parts = space.vertex_domain[detector.topology.faces[pairs][:, :, 0]]
+    parts = space.vertex_domain[faces[pairs][:, :, 0]]
     return patches_about(detector, [pairs[parts[:, 0] == parts[:, 1]]], TOUCHING_RADIUS)
 
 

@@ -278,11 +278,13 @@ class CollisionDetector:
             self._last_nearness = last = (clearance, rest_is_known), rule
         return last[1]
 
-    def without(self, faces: npt.NDArray[np.integer]) -> CollisionDetector:
-        """Return a detector whose searches leave out some faces."""
-        slots = self._tree.slot_face.reshape(-1, LEAF_SIZE)
-        corners = self._tree.corners.reshape(-1, 3, LEAF_SIZE).copy()
-        corners.transpose(0, 2, 1)[np.isin(slots, faces)] = -1
+    def without(self, faces: npt.NDArray[np.integer | np.bool_]) -> CollisionDetector:
+        """Return a detector whose searches leave out some faces: indices or an (F,) mask."""
+        left_out = np.zeros(self.topology.n_faces, dtype=np.bool_)
+        left_out[faces] = True
+        slots = self._tree.slot_face.reshape(-1, 1, LEAF_SIZE)
+        corners = self._tree.corners.reshape(-1, 3, LEAF_SIZE)
+        corners = np.where(left_out[slots], np.int32(-1), corners)
         return self._with(_tree=self._tree._replace(corners=corners.reshape(-1)))
 
     def _with(self, **changes: object) -> CollisionDetector:
