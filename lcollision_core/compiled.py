@@ -130,15 +130,15 @@ class _Compilations:
     """
 
     def __init__(self) -> None:
-        self.seconds = 0.0
-        self._last, self._started, self._depth = -math.inf, 0.0, 0
+        self._seconds, self._depth = 0.0, 0
+        self._last, self._started = -math.inf, 0.0
 
     def notify(self, event: Any) -> None:
-        now = time.monotonic()
+        now = time.perf_counter()
         if event.is_end:
             self._depth, self._last = self._depth - 1, now
             if self._depth == 0:
-                self.seconds += now - self._started
+                self._seconds += now - self._started
             return
         if now - self._last > _PAUSE_SECONDS:
             _log.info("compiling for this processor, which takes a few seconds the first time")
@@ -146,10 +146,17 @@ class _Compilations:
             self._started = now
         self._depth, self._last = self._depth + 1, now
 
+    def working_seconds(self) -> float:
+        now = self._started if self._depth > 0 else time.perf_counter()
+        return now - self._seconds
+
 
 _compilations = _Compilations()
 
 
-def seconds_compiling() -> float:
-    """Return the seconds that this process has spent on compiling so far."""
-    return _compilations.seconds
+def working_seconds() -> float:
+    """Return the seconds of a clock that stands still while this process compiles.
+
+    Work that is timed by it takes as long at the first start on a computer as at any other.
+    """
+    return _compilations.working_seconds()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.compiled import working_seconds
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.exact import Contacts, least_step
@@ -38,12 +38,12 @@ class Deadline:
 
     budget: float | None = None
     job: Job = UNWATCHED
-    started: float = field(default_factory=time.perf_counter)
+    started: float = field(default_factory=working_seconds)
 
     @property
     def seconds(self) -> float:
-        """Seconds so far."""
-        return time.perf_counter() - self.started
+        """Seconds so far, without those spent compiling."""
+        return working_seconds() - self.started
 
     @property
     def expired(self) -> bool:

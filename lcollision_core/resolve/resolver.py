@@ -83,7 +83,7 @@ class ResolveResult:
     iterations : of the solver at its least margin, for NLopt its evaluations; larger margins and
         restarts do not count
     evaluations : number of poses for which the predictor was evaluated
-    seconds : time spent
+    seconds : time spent, without compiling at a first start
     note : a sentence for the user, or None
     clearance : the requested clearance, normalised
     largest_change : the requested largest change of a vertex, normalised; None for no limit

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.compiled import working_seconds
 from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files import audit_mesh, read_mesh, read_pose_set
@@ -98,7 +98,7 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
 
     if request.scene.has_others or is_scene_file(path):
         return _check_scene(path, request, job)
-    start, rest = time.perf_counter(), request.rest_mesh
+    start, rest = working_seconds(), request.rest_mesh
     mesh = read_mesh(path, topology=None if rest is None else rest.topology)
     if rest is not None and rest.topology != mesh.topology:
         what = "does not have the faces of the rest pose"
@@ -130,7 +130,7 @@ def _check_scene(path: Path, request: CheckRequest, job: Job) -> CheckedMesh:
     from lcollision_core.bodies import MeshBody, open_body
     from lcollision_core.bodies.scene_file import body_of_scene
 
-    start, scene = time.perf_counter(), scene_of(str(path), request.scene)
+    start, scene = working_seconds(), scene_of(str(path), request.scene)
     bodies: list[Body] = []
     posed: list[npt.NDArray[np.float64]] = []
     for part in scene.bodies:
@@ -206,7 +206,7 @@ def _checked(
         least_at=least_at,
         energy=collisions.energy,
         colliding=collisions.colliding,
-        seconds=time.perf_counter() - start,
+        seconds=working_seconds() - start,
         not_counted=rules.sentence(collisions.excluded),
     ), collisions.pairs
 

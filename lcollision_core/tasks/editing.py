@@ -38,19 +38,14 @@ def resolve_pose(
 
     Returns
     -------
-    result : its seconds are of the search, without compilation on first use
+    result : the pose and how it was found
     before : (V, 3) float32 array, read-only: the mesh before, exactly as drawn
     """
-    from lcollision_core.compiled import seconds_compiling
-
     check = body.exact_check(placement, own and own(), options.clearance)
     before = check.drawn(check.decode(latent)[0])
     before.flags.writeable = False
-    start = seconds_compiling()
     resolver = body.resolver if own is None else body.resolver.with_check(check)
-    result = resolver.resolve(latent, options, job=job, placement=placement)
-    searched = max(0.0, result.seconds - (seconds_compiling() - start))
-    return replace(result, seconds=searched), before
+    return resolver.resolve(latent, options, job=job, placement=placement), before
 
 
 def resolve_frames(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.compiled import working_seconds
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.files import file_stamp
 from lcollision_core.files.safe import write_table
@@ -443,7 +444,7 @@ def resolve_one(
     from lcollision_core.bodies.motions import MotionChange, ground_facts
     from lcollision_core.motion import MotionReport, contact_report, resolve_motion, screen_motion
 
-    start, body, options = time.perf_counter(), request.body, request.options
+    start, body, options = working_seconds(), request.body, request.options
     substeps, workers = request.choice.substeps, request.workers
     check = body.exact_check(clearance=options.frame.clearance)
     stop = None if options.budget is None else _Budget(options.budget, job)
@@ -492,7 +493,7 @@ def _check_motion(request: ResolveMotionsRequest, motion: Motion, job: Job) -> R
     """Check one motion without changing it."""
     from lcollision_core.motion import MotionReport, contact_report, screen_motion
 
-    start, choice = time.perf_counter(), request.choice
+    start, choice = working_seconds(), request.choice
     screened = screen_motion(
         motion,
         request.body.exact_check(clearance=request.options.frame.clearance),
@@ -538,7 +539,7 @@ def _row(
         clearance=request.options.frame.clearance,
         least_distance=after.least_distance,
         least_frame=after.least_frame,
-        seconds=time.perf_counter() - start,
+        seconds=working_seconds() - start,
     )
 
 

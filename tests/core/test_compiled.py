@@ -46,8 +46,8 @@ def test_a_loop_is_cached_beside_its_file(tmp_path: Path) -> None:
 def test_compiling_is_logged_once_until_it_pauses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    now = [time.monotonic()]
-    monkeypatch.setattr(compiled, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    now = [time.perf_counter()]
+    monkeypatch.setattr(compiled, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     caplog.set_level(logging.INFO, compiled.__name__)
     triangular = _module(tmp_path).triangular
     for kinds, n_logged in (((np.int8, np.int16), 1), ((np.int16,), 1), ((np.int32, np.int64), 2)):
@@ -57,15 +57,18 @@ def test_compiling_is_logged_once_until_it_pauses(
         assert len(caplog.records) == n_logged
 
 
-def test_seconds_of_compiling_are_added_up_and_those_of_running_are_not(tmp_path: Path) -> None:
+def test_the_working_clock_stands_still_while_numba_compiles(tmp_path: Path) -> None:
     triangular = _module(tmp_path).triangular
-    before = compiled.seconds_compiling()
-    started = time.monotonic()
+    behind = time.perf_counter() - compiled.working_seconds()
+    started = time.perf_counter()
     assert triangular(np.uint8(4)) == 10
-    taken = compiled.seconds_compiling() - before
-    assert 0.0 < taken <= time.monotonic() - started
-    assert triangular(np.uint8(5)) == 15
-    assert compiled.seconds_compiling() - before == taken
+    stood = time.perf_counter() - compiled.working_seconds() - behind
+    assert 0.0 < stood <= time.perf_counter() - started
+    compiling = compiled._compilations
+    for is_end in (False, True):
+        compiling.notify(SimpleNamespace(is_end=is_end))
+        moments = [compiled.working_seconds() for _ in range(2)]
+        assert (moments[0] == moments[1]) != is_end
 
 
 def test_a_loop_runs_where_nothing_can_be_cached(
