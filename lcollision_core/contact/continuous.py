@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.compiled import compiled
 from lcollision_core.contact.distance import triangle_distance
+from lcollision_core.contact.kernels import SLACK
 from lcollision_core.errors import MissingExtraError
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
@@ -23,12 +23,6 @@ _USED_UP = 1.0
 
 _TOUCHING = 1e-9
 """Normalised length: pairs initially this near touch, and ipctk is not asked about them."""
-
-_BLOCK = 100_000
-"""Pairs that are tested together, which bounds memory."""
-
-_SLACK = 1e-6
-"""Relative and normalised margin within which pairs are tested."""
 
 
 class LinearPath:
@@ -73,21 +67,19 @@ class LinearPath:
         -------
         touches : False is certain; True is possible for pairs that come as near as 10⁻⁶
         """
-        blocks = (pairs[at : at + _BLOCK] for at in range(0, len(pairs), _BLOCK))
-        close: list[IntArray] = []
-        for block in blocks:
-            within_reach = self._within_reach(block, start, end)
-            if within_reach is None:
-                return True
-            close.append(within_reach)
-        one, other = np.concatenate([np.empty((0, 2), np.int64), *close]).T
+        at_first = triangle_distance(*(start[self._faces[side]] for side in pairs.T)).distance
+        if at_first.min(initial=np.inf) <= _TOUCHING:
+            # ipctk would complain about touching pairs on standard output.
+            return True
+        # The approach of two faces is at most the largest relative motion of two of their corners.
+        moved, other_moved = ((end - start)[self._faces[side]] for side in pairs.T)
+        apart = np.linalg.norm(moved[:, :, None] - other_moved[:, None], axis=3)
+        reach = apart.max(axis=(1, 2), initial=0.0)
+        one, other = pairs[at_first <= reach * (1.0 + SLACK) + SLACK].T
         if not len(one):
             return False
         low, high = np.minimum(start, end), np.maximum(start, end)
-        of_edges, of_faces = (
-            (low[corners].min(axis=1), high[corners].max(axis=1))
-            for corners in (self._edges, self._faces)
-        )
+        points = np.arange(len(start))[:, None]
         edges = np.sort(_all_with_all(self._edges_of[one], self._edges_of[other]), axis=1)
         vertices = np.concatenate(
             [
@@ -97,56 +89,15 @@ class LinearPath:
         )
         candidates = self._ipctk.Candidates()
         candidates.ee_candidates = [
-            self._ipctk.EdgeEdgeCandidate(*pair) for pair in _meeting(edges, of_edges, of_edges)
+            self._ipctk.EdgeEdgeCandidate(*pair)
+            for pair in _meeting(edges, self._edges, self._edges, low, high)
         ]
         candidates.fv_candidates = [
             self._ipctk.FaceVertexCandidate(*pair)
-            for pair in _meeting(vertices, of_faces, (low, high))
+            for pair in _meeting(vertices, self._faces, points, low, high)
         ]
         poses = (np.asfortranarray(pose) for pose in (start, end))
         return not candidates.is_step_collision_free(self._mesh, *poses, narrow_phase_ccd=self._ccd)
-
-    def _within_reach(self, pairs: IntArray, start: FloatArray, end: FloatArray) -> IntArray | None:
-        """Return the pairs that are near enough at first to meet; None if one touches.
-
-        The approach of two faces is at most the largest relative motion of two of their corners.
-        """
-        meets = np.empty(len(pairs), dtype=np.bool_)
-        _fill_within_reach(pairs, self._faces, start, end - start, meets)
-        pairs = pairs[meets]
-        at_first = triangle_distance(*(start[self._faces[side]] for side in pairs.T)).distance
-        # ipctk would complain about touching pairs on standard output.
-        return None if at_first.min(initial=np.inf) <= _TOUCHING else pairs
-
-
-@compiled
-def _fill_within_reach(
-    pairs: IntArray,
-    faces: IntArray,
-    start: FloatArray,
-    moves: FloatArray,
-    meets: npt.NDArray[np.bool_],
-) -> None:
-    """Fill in whether the gap between the initial boxes of (P, 2) faces is within their motion."""
-    for pair in range(len(pairs)):
-        one, other = faces[pairs[pair, 0]], faces[pairs[pair, 1]]
-        squared_reach = 0.0
-        for a in one:
-            for b in other:
-                squared = 0.0
-                for axis in range(3):
-                    squared += (moves[a, axis] - moves[b, axis]) ** 2
-                squared_reach = max(squared_reach, squared)
-        squared_gap = 0.0
-        for axis in range(3):
-            low, high, other_low, other_high = np.inf, -np.inf, np.inf, -np.inf
-            for corner in range(3):
-                low = min(low, start[one[corner], axis])
-                high = max(high, start[one[corner], axis])
-                other_low = min(other_low, start[other[corner], axis])
-                other_high = max(other_high, start[other[corner], axis])
-            squared_gap += max(other_low - high, low - other_high, 0.0) ** 2
-        meets[pair] = squared_gap <= (np.sqrt(squared_reach) * (1.0 + _SLACK) + _SLACK) ** 2
 
 
 def require_ipctk() -> Any:
@@ -175,12 +126,23 @@ def _all_with_all(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> npt.NDArray
 
 def _meeting(
     pairs: npt.NDArray[np.int64],
-    first: tuple[FloatArray, FloatArray],
-    second: tuple[FloatArray, FloatArray],
+    first: npt.NDArray[np.integer],
+    second: npt.NDArray[np.integer],
+    low: FloatArray,
+    high: FloatArray,
 ) -> list[list[int]]:
-    """Return the distinct (P, 2) pairs whose boxes, (lows, highs) of either side, overlap."""
-    n = np.int64(len(second[0]))
+    """Return the distinct (P, 2) pairs whose boxes overlap.
+
+    Parameters
+    ----------
+    first, second : (n, corners) vertices of either side
+    low, high : (V, 3) box of each vertex
+    """
+    n = np.int64(len(second))
     a, b = np.divmod(np.unique(pairs @ np.array([n, 1])), n)
-    meet = ((first[0][a] <= second[1][b]) & (second[0][b] <= first[1][a])).all(axis=1)
+    (a_low, a_high), (b_low, b_high) = (
+        (low[corners].min(axis=1), high[corners].max(axis=1)) for corners in (first[a], second[b])
+    )
+    meet = ((a_low <= b_high) & (b_low <= a_high)).all(axis=1)
     meeting_pairs: list[list[int]] = np.stack([a, b], axis=1)[meet].tolist()
     return meeting_pairs

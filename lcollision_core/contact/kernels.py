@@ -503,6 +503,56 @@ def drop_excluded(tree: FaceTree, exclusions: Exclusions, found: PairBuffer, n_f
     return n_kept
 
 
+SLACK = 1e-6
+"""Relative and normalised margin within which moving faces may meet."""
+
+
+@compiled
+def drop_out_of_reach(
+    tree: FaceTree, vertices: FloatArray, moves: FloatArray, n_found: int, found: PairBuffer
+) -> int:
+    """Drop pairs of moving faces whose boxes are at first farther apart than their motion.
+
+    The approach of two faces is at most the largest relative motion of two of their corners.
+
+    Parameters
+    ----------
+    vertices, moves : (V, 3) at first and on the linear path, normalised
+    n_found : number of pairs in `found`, which is overwritten without rules
+
+    Returns
+    -------
+    n_kept : number of pairs left
+    """
+    pair, moved = np.empty((2, 3, 3)), np.empty((2, 3, 3))
+    n_kept = 0
+    for n in range(n_found):
+        for side in range(2):
+            gather(tree.corners, vertices, found.slots[n, side], pair, side)
+            gather(tree.corners, moves, found.slots[n, side], moved, side)
+        squared_reach = 0.0
+        for i in range(3):
+            for j in range(3):
+                squared = 0.0
+                for c in range(3):
+                    squared += (moved[0, i, c] - moved[1, j, c]) ** 2
+                squared_reach = max(squared_reach, squared)
+        squared_gap = 0.0
+        for c in range(3):
+            low = min(pair[0, 0, c], min(pair[0, 1, c], pair[0, 2, c]))
+            high = max(pair[0, 0, c], max(pair[0, 1, c], pair[0, 2, c]))
+            other_low = min(pair[1, 0, c], min(pair[1, 1, c], pair[1, 2, c]))
+            other_high = max(pair[1, 0, c], max(pair[1, 1, c], pair[1, 2, c]))
+            squared_gap += max(other_low - high, low - other_high, 0.0) ** 2
+        if squared_gap > (np.sqrt(squared_reach) * (1.0 + SLACK) + SLACK) ** 2:
+            continue
+        # By element, as in `drop_excluded`.
+        found.slots[n_kept, 0] = found.slots[n, 0]
+        found.slots[n_kept, 1] = found.slots[n, 1]
+        n_kept += 1
+    return n_kept
+
+
 @compiled
 def test_pairs(
     pose: FloatArray,

@@ -34,6 +34,7 @@ from lcollision_core.contact.kernels import (
     SMALL_SINE_SQUARED,
     add_vertex_energy,
     drop_excluded,
+    drop_out_of_reach,
     judge,
     remember,
     search_pose,
@@ -583,8 +584,8 @@ class Searcher:
         uncounted : as for `search_pose`
         nearness : find pairs that are too near; `signed` then holds their signed distances
         exclusions : used instead of the detector's own
-        end : (V, 3), finite; find pairs whose boxes overlap on the linear path to this pose, with
-            the rules that hold where they penetrate
+        end : (V, 3), finite; find pairs that may meet on the linear path to this pose, with the
+            rules that hold where they penetrate
         """
         ruled = self._exclusions if exclusions is None else exclusions
         self._take(pose[None], unit)
@@ -627,6 +628,10 @@ class Searcher:
             if n_found < 0:
                 self._refuse(self._poses[0], number)
             if end is not None:
+                moves = (swept - self._poses[0]) * self._scale
+                n_found = drop_out_of_reach(
+                    self._tree, self._work.vertices, moves, n_found, self.found
+                )
                 # Apply the rules that hold for pairs that penetrate, whatever the depth.
                 self.found.squared_depth[:n_found] = np.inf
                 judge(self._tree, ruled, self.found, 0, n_found)

@@ -190,12 +190,15 @@ class Check(_CharacterRequest, tag="check"):
     vertices : (W, 3) vertices of all parts as shown; checked instead of the rig's if given
     before : (W, 3) vertices shown before: the linear path from there is checked too
     clearance : normalised; faces that are nearer collide
+    counted_only : whether to leave out the pairs that contact rules exclude, and the least
+        distance, which is faster
     """
 
     transforms: Array | None = None
     vertices: Array | None = None
     before: Array | None = None
     clearance: Clearance = 0.0
+    counted_only: bool = False
 
 
 class Drag(_CharacterRequest, tag="drag"):

@@ -14,7 +14,7 @@ from threading import Lock
 from typing import Any, BinaryIO, cast
 
 from lcollision_core.errors import CancelledError, LCollisionError
-from lcollision_core.jobs import Job, at_most_every
+from lcollision_core.jobs import Job, at_most_every, available_cores
 from lcollision_core.serve import messages as m
 from lcollision_core.serve.characters import OpenedCharacter, character_id, open_arrays, open_file
 from lcollision_core.serve.work import (
@@ -44,8 +44,8 @@ log = logging.getLogger(__name__)
 class Session:
     """Answers the requests of one stream until it ends.
 
-    Opening, rules, checks and drags are done in order. Long work runs beside them, with the rules
-    that were set before its request.
+    Opening, rules and drags are done in order. Checks, on all cores, and long work, one at a time,
+    run beside them with the rules that were set before their request.
 
     Parameters
     ----------
@@ -63,8 +63,9 @@ class Session:
     def run(self) -> None:
         """Answer until the stream ends, then cancel the running jobs."""
         with (
-            # `_lane`, which feeds `_long`, must end first.
+            # `_lane`, which feeds the others, must end first.
             ThreadPoolExecutor(1, "engine, long") as self._long,
+            ThreadPoolExecutor(available_cores(), "engine, checks") as self._checks,
             ThreadPoolExecutor(1, "engine") as self._lane,
         ):
             try:
@@ -138,15 +139,16 @@ class Session:
         self._lane.submit(self._do, request, job)
 
     def _do(self, request: Any, job: Job) -> None:
-        """Answer a request, in the other thread if it is long work."""
-        work = _LONG.get(type(request))
-        if work is not None:
-            opened = self._characters.get(request.character)
-            if opened is not None:
-                do = partial(work, opened, request, job)
-                self._long.submit(self._finish, request.id, job, do)
-                return
-        self._finish(request.id, job, partial(self._quick, request))
+        """Answer a request, in other threads if it is a check or long work."""
+        opened = self._characters.get(getattr(request, "character", ""))
+        if opened is not None and isinstance(request, m.Check):
+            do = partial(check_pose, opened, request)
+            self._checks.submit(self._finish, request.id, job, do)
+        elif opened is not None and (work := _LONG.get(type(request))) is not None:
+            do = partial(work, opened, request, job)
+            self._long.submit(self._finish, request.id, job, do)
+        else:
+            self._finish(request.id, job, partial(self._quick, request))
 
     def _finish(self, number: int, job: Job, do: Callable[[], Reply]) -> None:
         kind, fields = "result", {}
@@ -183,8 +185,6 @@ class Session:
                 self._characters[request.character] = replace(opened, body=body)
                 self._dragging = None
                 return {"rules": body.rules.to_json(), "in_words": body.rules.summary()}
-            case m.Check():
-                return check_pose(opened, request)
             case m.Drag():
                 if request.transforms is not None:
                     self._dragging = Dragging.begin(opened, request)

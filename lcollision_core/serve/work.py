@@ -74,8 +74,9 @@ def check_pose(opened: OpenedCharacter, request: m.Check) -> Reply:
     if vertices is None:
         raise LCollisionError.must_be("check", "given transforms or vertices", "neither")
     exact = body.exact_check(clearance=request.clearance)
-    nearest = exact.least_distance(vertices) if request.clearance > 0.0 else None
-    collisions, touches = exact.find(vertices, counted_only=False), False
+    has_distance = request.clearance > 0.0 and not request.counted_only
+    nearest = exact.least_distance(vertices) if has_distance else None
+    collisions, touches = exact.find(vertices, counted_only=request.counted_only), False
     if request.before is not None and not collisions.colliding:
         touches = exact.collide_between(opened.joined_vertices(request.before), vertices)
     return {

@@ -4,8 +4,9 @@
 import re
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import bpy
 import numpy as np
@@ -41,7 +42,7 @@ _ROUGHER, _JUMP = 3.0, 0.1
 times the former one and `_JUMP` times the skeleton's size."""
 
 _FREE = ".free"
-_IN_FLIGHT = 4
+_IN_FLIGHT = 8
 _BESIDE = 2
 """Frames read on each side of a range, so that the motion's continuation is known."""
 _POSES_A_SECOND, _MOST_POSES = 10, 300
@@ -176,9 +177,10 @@ def read_frames(
     character: OpenCharacter,
     wanted: Wanted,
     numbers: list[int],
-    keep: bool,
+    keep: bool = False,
     within: range | None = None,
-) -> Iterator[str]:
+    counted_only: bool = True,
+) -> Generator[str, None, Frames]:
     """Go through frames step by step, check each as shown, and return `Frames`.
 
     A collision between a frame and the next counts for the former.
@@ -186,17 +188,19 @@ def read_frames(
     Parameters
     ----------
     keep : whether to keep vertices
+    counted_only : whether to leave out the pairs that do not count, which is faster
     """
     frames = Frames(numbers, within or range(len(numbers)))
     waiting, scene = deque(), context.scene
     before, ahead = scene.frame_current, None
+    check = partial(character.check, rigged, wanted.clearance, counted_only=counted_only)
     try:
         for number in numbers:
             yield f"Checking frame {number} of {numbers[-1]}"
             if ahead != number:
                 scene.frame_set(number)
                 shown = Shown.of(rigged)
-                own = character.check(rigged, wanted.clearance, shown)
+                own = check(shown)
             frames.transforms.append(shown.transforms)
             frames.states.append(rigged.state())
             if keep:
@@ -208,7 +212,7 @@ def read_frames(
                 ahead = number + 1 if share == 1.0 else None
                 scene.frame_set(ahead or number, subframe=0.0 if ahead else share)
                 start, shown = shown, Shown.of(rigged)
-                own = character.check(rigged, wanted.clearance, shown, start)
+                own = check(shown, start)
                 requests.append(own)
             waiting.append(requests)
             if len(waiting) > _IN_FLIGHT:
@@ -218,6 +222,24 @@ def read_frames(
     finally:
         scene.frame_set(before)
     return frames
+
+
+def with_uncounted(
+    context: bpy.types.Context, rigged: Rigged, character: OpenCharacter, frames: Frames
+) -> Generator[str, None, Frames]:
+    """Return frames as they are shown, with the pairs that do not count.
+
+    Of these only those that penetrate are listed, so no clearance is needed, which is faster.
+    """
+    numbers = [frames.numbers[at] for at in frames.within]
+    again = yield from read_frames(
+        context, rigged, character, Wanted(0.0), numbers, counted_only=False
+    )
+    found = list(frames.found)
+    for at, reply in zip(frames.within, again.found, strict=True):
+        left_out = ("excluded_pairs", "excluded_deepest", "not_counted")
+        found[at] = found[at] | {key: reply[key] for key in left_out}
+    return replace(frames, found=found)
 
 
 def _answers(character: OpenCharacter, requests: list[Request]) -> Generator[str, None, dict]:
@@ -272,7 +294,9 @@ class LCOLLISION_OT_check_action(ModalOperator, bpy.types.Operator):
         rigged = Rigged.of(context)
         character = yield from open_character(rigged, settings)
         numbers, wanted = frame_range(rigged, context.scene), Wanted(character.clearance(rigged))
-        frames = yield from read_frames(context, rigged, character, wanted, numbers, False)
+        frames = yield from read_frames(
+            context, rigged, character, wanted, numbers, counted_only=False
+        )
         list_frames(context.scene, frames)
         clear()
         settings.verdict, settings.details = verdict(frames, settings), frames.not_counted
@@ -289,7 +313,11 @@ class LCOLLISION_OT_resolve_action(ModalOperator, bpy.types.Operator):
         """Read, resolve, write a copy of the action, and check it as Blender shows it."""
         rigged = Rigged.of(context)
         resolved = yield from resolving(context, rigged, settings)
-        frames, written, now = resolved.frames, resolved.written, resolved.now
+        frames, written = resolved.frames, resolved.written
+        with resolved.taken_back_on_failure():
+            now = yield from with_uncounted(
+                context, resolved.shown, resolved.character, resolved.now
+            )
         list_frames(context.scene, now)
         clear()
         settings.verdict, settings.details = verdict(now, settings), now.not_counted
@@ -312,6 +340,7 @@ class Resolved:
 
     Attributes
     ----------
+    rigged : the character that was asked for
     character, wanted : used for checking its frames
     frames : as before
     written : the better action; None if there is none and nothing was changed
@@ -319,6 +348,7 @@ class Resolved:
     kept : spans that the engine has not freed, with reasons; frames by index
     """
 
+    rigged: Rigged
     character: OpenCharacter
     wanted: Wanted
     frames: Frames
@@ -330,6 +360,21 @@ class Resolved:
     def now(self) -> Frames:
         """The present frames."""
         return self.frames if self.written is None else self.written.now
+
+    @property
+    def shown(self) -> Rigged:
+        """The character that shows them."""
+        return self.rigged if self.written is None else self.written.rigged
+
+    @contextmanager
+    def taken_back_on_failure(self) -> Iterator[None]:
+        """Restore everything as it was if the steps inside fail or are stopped."""
+        try:
+            yield
+        except BaseException:
+            if self.written is not None:
+                self.written.take_back()
+            raise
 
 
 def resolving(
@@ -366,7 +411,7 @@ def resolving(
         "keep_feet": settings.keep_feet,
         "least_change": LEAST_CHANGE,
     }
-    resolved = Resolved(character, wanted, frames)
+    resolved = Resolved(rigged, character, wanted, frames)
     for target in targets if frames.colliding else ():
         resolved.unkeyable = {} if target.is_copied else unkeyable_bones(target, every)
         known = asked | {

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from .actions import Frames, Resolved, list_frames, read_frames, resolving, told_of
+from .actions import Frames, Resolved, list_frames, read_frames, resolving, told_of, with_uncounted
 from .link import Steps
 from .operators import counted
 from .results import clear
@@ -39,16 +39,11 @@ class LCOLLISION_OT_prepare_cloth(ModalOperator, bpy.types.Operator):
             resolved = yield from resolving(
                 context, rigged, settings, settings.cloth_gap, settings.cloth_subframes
             )
-            written, now = resolved.written, resolved.now
-            shown = rigged if written is None else written.rigged
+            written, now, shown = resolved.written, resolved.now, resolved.shown
             caches: dict[bpy.types.Object, Path] = {}
             if folder is not None:
-                try:
+                with resolved.taken_back_on_failure():
                     caches = yield from _write_caches(scene, shown, resolved, folder)
-                except BaseException:
-                    if written is not None:
-                        written.take_back()
-                    raise
         if caches:
             _show_caches(caches, now.numbers[now.within.start], settings.cloth_subframes)
             now = yield from read_frames(
@@ -57,8 +52,9 @@ class LCOLLISION_OT_prepare_cloth(ModalOperator, bpy.types.Operator):
                 resolved.character,
                 resolved.wanted,
                 [now.numbers[at] for at in now.within],
-                False,
             )
+        with resolved.taken_back_on_failure():
+            now = yield from with_uncounted(context, shown, resolved.character, now)
         why = _reasons(resolved, now)
         list_frames(scene, now)
         for item in settings.frames:

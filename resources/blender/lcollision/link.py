@@ -51,6 +51,7 @@ class OpenCharacter:
         clearance: float,
         shown: Shown | None = None,
         before: Shown | None = None,
+        counted_only: bool = False,
     ) -> Request:
         """Request a check of a pose, by default the shown one, and of the linear path to it."""
         shown = shown or Shown.of(rigged)
@@ -61,6 +62,7 @@ class OpenCharacter:
             vertices=shown.vertices,
             before=None if before is None else before.vertices,
             clearance=clearance,
+            counted_only=counted_only,
         )
 
     def require_same_meshes(self, rigged: Rigged, n_vertices: int) -> None:

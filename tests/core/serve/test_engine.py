@@ -175,6 +175,23 @@ def test_the_way_to_a_pose_is_checked_as_well(engine: Engine, opened: Reply) -> 
     assert not touches(rest + [0.1, 0.2, 0.3])
 
 
+def test_a_quick_check_leaves_out_what_does_not_count(engine: Engine, opened: Reply) -> None:
+    character, left = opened["character"], ["Left upper arm", "Left forearm", "Left hand"]
+    asked = {"character": character, "transforms": TRANSFORMS[20], "clearance": 0.01}
+    whole, quick = (engine.ask("check", counted_only=only, **asked) for only in (False, True))
+    assert whole["pairs"] > 0
+    assert whole["least_distance"] is not None
+    assert quick["least_distance"] is None
+    for told in ("pairs", "deepest", "parts"):
+        assert quick[told] == whole[told]
+    rules = {**opened["rules"], "left_out": [name for name in opened["parts"] if name in left]}
+    engine.ask("set_rules", character=character, rules=rules)
+    whole, quick = (engine.ask("check", counted_only=only, **asked) for only in (False, True))
+    assert sum(whole["excluded_pairs"].values()) > 0
+    assert sum(quick["excluded_pairs"].values()) == 0
+    engine.ask("set_rules", character=character, rules=opened["rules"])
+
+
 def test_the_deepest_pair_may_be_one_that_is_not_listed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -387,11 +404,15 @@ def test_rules_are_set_and_hold_for_what_follows(engine: Engine, opened: Reply) 
     groups = engine.ask("rules", character=character)["groups"]["body parts"]
     assert {"Torso", "Left upper arm"} <= set(groups)
     asked = {"character": character, "transforms": TRANSFORMS[20]}
-    assert engine.ask("check", **asked)["colliding"]
     left_out = [name for name in groups if name.startswith("Left")]
     rules = {**opened["rules"], "left_out": left_out}
-    assert engine.ask("set_rules", character=character, rules=rules)["in_words"].startswith("with")
-    assert not engine.ask("check", **asked)["colliding"]
+    # Sent together, each check has the rules set before it.
+    before = engine.send("check", **asked)
+    reply = engine.send("set_rules", character=character, rules=rules)
+    after = engine.send("check", **asked)
+    assert before.result()["colliding"]
+    assert reply.result()["in_words"].startswith("with")
+    assert not after.result()["colliding"]
     with pytest.raises(EngineError, match="nowhere"):
         engine.ask("set_rules", character=character, rules={"left_out": ["nowhere"]})
 
