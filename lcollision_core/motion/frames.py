@@ -252,6 +252,15 @@ class Frames:
         freed = slide_back(check, problem, nearer)
         return freed if self.is_near_enough(frame, freed) else None
 
+    def polished(self, frame: int, codes: FloatArray) -> tuple[FloatArray | None, HalfSpacesOfPose]:
+        """Return free codes next to a colliding (D,) pose of a frame, and what separates them."""
+        check, problem = self.check(frame), self.problem(frame)
+        contacts = Contacts(check)
+        freed = polish(check, problem, codes, contacts)
+        if freed is not None and not self.is_near_enough(frame, freed):
+            freed = None
+        return freed, (contacts.normals, contacts.offsets)
+
     def near(self, frame: int, codes: FloatArray) -> FloatArray | None:
         """Return the free codes nearest to (D,) codes at a frame, None if none are near enough."""
         check, resolver = self.check(frame), self.resolver
@@ -285,11 +294,11 @@ _FLICKER = 10.0
 
 def chain_corrections(
     frames: Frames,
-    run: range,
+    runs: Sequence[Sequence[int]],
     before: FloatArray | None = None,
     so_far: dict[int, FloatArray] | None = None,
 ) -> dict[int, FloatArray]:
-    """Resolve a run of colliding frames in turn, forwards and backwards.
+    """Resolve colliding frames of each run in turn, forwards and backwards.
 
     Each frame is polished from its target plus the correction of its neighbour, so that contacts
     stay on one side. The cheaper of the two directions is returned.
@@ -297,8 +306,8 @@ def chain_corrections(
     Parameters
     ----------
     frames : of the motion
-    run : colliding frames
-    before : (D,) correction of the frame before the run; None if that is free
+    runs : numbers of colliding frames, ascending
+    before : (D,) correction of the frame before the first run; None if that is free
     so_far : receives the corrections as frames are resolved, in case the work is stopped
 
     Returns
@@ -306,14 +315,17 @@ def chain_corrections(
     corrections : (D,) by frame, of the frames that were resolved
     """
     freed = {} if so_far is None else so_far
-    orders: tuple[tuple[Iterable[int], FloatArray | None], ...] = (
-        (run, before),
-        (reversed(run), None),
-    )
-    forwards, backwards = frames.pool.map(
-        lambda order: _chained(frames, order[0], order[1], freed), orders
-    )
-    chosen = min(forwards, backwards, key=lambda found: _cost(frames, run, found, before))
+    starts = [before, *[None] * (len(runs) - 1)]
+    ways: list[tuple[Iterable[int], FloatArray | None]] = []
+    for run, near in zip(runs, starts, strict=False):
+        ways += [(run, near), (reversed(run), None)]
+    chains = list(frames.pool.map(lambda way: _chained(frames, way[0], way[1], freed), ways))
+    chosen: dict[int, FloatArray] = {}
+    for run, near, forwards, backwards in zip(
+        runs, starts, chains[::2], chains[1::2], strict=False
+    ):
+        is_nearer = _cost(frames, run, forwards, near) <= _cost(frames, run, backwards, near)
+        chosen |= forwards if is_nearer else backwards
     freed.update(chosen)
     return chosen
 
@@ -334,16 +346,19 @@ def _chained(
 
 
 def _cost(
-    frames: Frames, run: range, found: dict[int, FloatArray], before: FloatArray | None
+    frames: Frames,
+    run: Sequence[int],
+    chain: Mapping[int, FloatArray],
+    before: FloatArray | None,
 ) -> tuple[int, float]:
     still = np.zeros(frames.motion.codes.shape[1])
     first = still if before is None else before
-    rows = np.array([first, *(found.get(frame, still) for frame in run), still])
+    rows = np.array([first, *(chain.get(frame, still) for frame in run), still])
     cost = sum(
         weight * np.einsum("td,de,te->", moved, frames.metric, moved)
         for weight, moved in ((1.0, rows), (_FLICKER, np.diff(rows, axis=0)))
     )
-    return len(run) - len(found), float(cost)
+    return len(run) - len(chain), float(cost)
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,9 @@ WINDOW, OVERLAP = 120, 24
 """Most frames, at 30 a second, that are resolved together, and the number of these that the next
 window resolves again: the program's cost grows with the square of the frames."""
 
+_SPACING = 4
+"""Distance of the frames, at 30 a second, that are resolved first."""
+
 _SOFT_ROUNDS = 6
 """Most rounds of smoothing corrections that remove overlap, each without the frames that became
 worse."""
@@ -520,13 +523,12 @@ class _Resolution:
         after = corrections(window.stop) if ends and not is_open else None
         start = np.zeros((len(window), motion.codes.shape[1]))
         known = self.before[self._own(window)].copy()
+        knots = _knots(known, motion.in_frames(_SPACING))
+        near = before[1] if before is not None and not known[0] else None
         freed = self.freed[span] = {}
-        for run in runs(~known):
-            frames_of_run = range(window.start + run.start, window.start + run.stop)
-            near = before[1] if before is not None and run.start == 0 else None
-            chained = chain_corrections(frames, frames_of_run, near, freed)
-            for frame, correction in chained.items():
-                start[frame - window.start], known[frame - window.start] = correction, True
+        colliding = [[window.start + at for at in run if knots[at]] for run in runs(~known)]
+        for frame, correction in chain_corrections(frames, colliding, near, freed).items():
+            start[frame - window.start], known[frame - window.start] = correction, True
         program = SpanProgram(
             frames,
             window,
@@ -536,6 +538,7 @@ class _Resolution:
             after,
             self._smoothness,
             [_fractions(self.substeps[at]) for at in self._own(window)],
+            knots,
             is_round and len(window) == n,
             tell,
         )
@@ -729,6 +732,20 @@ def _free_pairs(
     """Return the frames that, like the next one, are free and within a range."""
     usable = free[again] & np.isin(np.arange(len(again)), within)
     return np.flatnonzero(usable[:-1] & usable[1:])
+
+
+def _knots(free: npt.NDArray[np.bool_], spacing: int) -> npt.NDArray[np.bool_]:
+    """Choose evenly spaced frames, and the ends, of each run of free and of colliding frames.
+
+    Parameters
+    ----------
+    free : (n,) whether each frame is free
+    spacing : >= 1
+    """
+    knots = np.zeros(len(free), dtype=np.bool_)
+    for run in (*runs(free), *runs(~free)):
+        knots[run.start : run.stop : spacing] = knots[run.stop - 1] = True
+    return knots
 
 
 def _fractions(substeps: int) -> FloatArray:

@@ -232,7 +232,7 @@ _LEFT_BY_ROUND = 0.96
 """Share of the remaining work that a round is reported to leave."""
 
 _RESOLVED_AT = (6, 8, 10, 12)
-"""Rounds in which frames that still collide look for a free pose next to the smooth one."""
+"""Rounds in which frames without a free pose look for one by all means of Resolve."""
 
 _PINNED_AT = (14, 17, 20)
 """Rounds in which frames that still collide are pinned to free poses, and the others settle
@@ -249,6 +249,13 @@ their lacking distance below which there is progress."""
 _SEARCHES, _SETTLED = 6, 0.95
 """Most searches of a span, and the share of the cost that a search must go below to be followed by
 another one."""
+
+_ENOUGH = 1.25
+"""Cost, relative to that of a search of the knots alone, up to which a span is not searched
+again."""
+
+_FALLING = 0.4
+"""Share of the cost below which a search is followed by another one in any case."""
 
 _STILL = 1e-4
 """Normalised distance from a pose that was free within which a frame is taken as free, until all
@@ -313,6 +320,7 @@ class SpanProgram:
     smoothness : w
     fractions : for each of the n frames, fractions of the way to the next of poses that must be
         free too
+    knots : (n,) frames that are resolved first, the others and the poses between after them
     is_cycle : whether the first frame follows the last
     tell : called with an estimate of the share done, in [0, 1)
     """
@@ -325,6 +333,7 @@ class SpanProgram:
     after: FloatArray | None
     smoothness: float
     fractions: Sequence[FloatArray]
+    knots: npt.NDArray[np.bool_]
     is_cycle: bool = False
     tell: Callable[[float], None] = UNWATCHED.report
     _rounds: int = 0
@@ -337,6 +346,8 @@ class SpanProgram:
     _best: _Evaluation | None = None
 
     def __post_init__(self) -> None:
+        # The frames that are checked; others are taken as free.
+        self._watched = self.knots
         self._targets = self.frames.motion.codes[self.span.start : self.span.stop]
         self._contacts = [[] for _ in self.span]
         # The newest known free pose of each frame.
@@ -351,17 +362,33 @@ class SpanProgram:
 
     def solve(self) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Return the (n, D) corrections, and (n,) whether each frame is free with them."""
-        best, gives_way = self._search(), True
+        best, least = self._search(None), 0.0
+        if not self.knots.all():
+            # What is between the knots moves with them.
+            self._watched = np.ones_like(self.knots)
+            if self._rounds < _PINNED_AT[1]:
+                least = self._cost(best.corrections)
+            best = self._search(best)
+        best = self._settled_search(best, _ENOUGH * least)
+        put_back: npt.NDArray[np.bool_] = ~best.is_free & self._is_known
+        chosen = np.where(put_back[:, None], self._known - self._targets, best.corrections)
+        return chosen, best.is_free | put_back
+
+    def _settled_search(self, best: _Evaluation, enough: float) -> _Evaluation:
+        """Search again while that gains much, and costs more than enough; return the best."""
+        gives_way, last = True, 0.0
         if best.n_apart and self._drop_contacts(best):
             # Search again without the touches that stay apart.
-            best = self._search()
+            best = self._search(None)
         for _ in range(1, _SEARCHES):
-            self._best = best
-            if self._is_settled(best) and (best.score > 0.0 or not best.corrections.any()):
+            self._best, cost = best, self._cost(best.corrections)
+            is_done = best.score > 0.0 or _FALLING * last <= cost <= enough
+            if self._is_settled(best) and is_done:
                 break
+            last = cost
             self._gives_way = gives_way
             self._forget(best)
-            solution = self._search()
+            solution = self._search(None)
             gives_way = self._is_settled(solution)
             before, after = self._worth(best), self._worth(solution)
             if after < before:
@@ -370,9 +397,7 @@ class SpanProgram:
                     break
             elif gives_way or not self._gives_way:
                 break
-        put_back: npt.NDArray[np.bool_] = ~best.is_free & self._is_known
-        chosen = np.where(put_back[:, None], self._known - self._targets, best.corrections)
-        return chosen, best.is_free | put_back
+        return best
 
     def so_far(self) -> dict[int, FloatArray]:
         """Return the (D,) corrections that free frames, if the search is stopped."""
@@ -400,15 +425,22 @@ class SpanProgram:
             seen.clear()
         self._limits.clear()
         ends = self._targets + best.corrections
-        self._known = np.where(best.is_free[:, None], ends, self._known)
-        self._is_known |= best.is_free
+        freed = best.is_free & self._watched
+        self._known = np.where(freed[:, None], ends, self._known)
+        self._is_known |= freed
         self._known[self._is_free_before] = self._targets[self._is_free_before]
         self._was_free = self._is_free_before.copy()
 
-    def _search(self) -> _Evaluation:
-        """Return the first corrections that free all frames, else the best of all rounds."""
+    def _search(self, begin: _Evaluation | None) -> _Evaluation:
+        """Return the first corrections that free all frames, else the best of all rounds.
+
+        Parameters
+        ----------
+        begin : the result of a search of fewer frames, to go on from; None for no corrections
+        """
         n = len(self._targets)
-        start = self._evaluate(np.zeros(self._targets.shape), {}, resolves=False)
+        corrections = np.zeros(self._targets.shape) if begin is None else begin.corrections
+        start = self._evaluate(corrections, {}, resolves=False)
         if start.score == 0.0 and not start.n_apart:
             return start
         pinned: dict[int, FloatArray] = {}
@@ -512,31 +544,30 @@ class SpanProgram:
         Parameters
         ----------
         pinned : frames that are free
-        resolves : whether colliding frames look for a nearer free pose
+        resolves : whether colliding frames without a free pose look farther for one
         still : distance from a pose that was free within which a frame counts as free
         """
         poses = self._targets + corrections
         n, frames = len(poses), self.frames
-        asked = [at for at in range(n) if at not in pinned]
+        watched = [at for at in np.flatnonzero(self._watched).tolist() if at not in pinned]
         asked = [
             at
-            for at in asked
+            for at in watched
             if not (self._was_free[at] and self._is_near(poses[at], self._known[at], still))
         ]
-        # Most frames that were free still are; a check without contacts is faster.
-        likely = [at for at in asked if self._was_free[at]]
-        verdicts = frames.are_free([self.span[at] for at in likely], codes=poses[likely])
-        now_free = set(np.compress(verdicts, likely).tolist())
-        self._known[list(now_free)] = poses[list(now_free)]
-        asked = [at for at in asked if at not in now_free]
-        reached = frames.pool.map(lambda at: self._reached(at, poses[at], resolves), asked)
+        verdicts = frames.are_free([self.span[at] for at in asked], codes=poses[asked])
+        self._was_free[asked] = verdicts
+        now_free, colliding = (list(np.compress(side, asked)) for side in (verdicts, ~verdicts))
+        self._known[now_free], self._is_known[now_free] = poses[now_free], True
+        for _ in frames.pool.map(lambda at: self._meet(at, poses[at], resolves), colliding):
+            pass
         is_free = np.ones(n, dtype=np.bool_)
-        is_free[asked] = self._was_free[asked] = list(reached)
+        is_free[colliding] = False
         is_whole = self._are_hopeless(~is_free)
         places = [
             (at, fraction)
             for at in range(n if self.is_cycle else n - 1)
-            if is_free[at] and is_free[(at + 1) % n]
+            if self._watched.all() and is_free[at] and is_free[(at + 1) % n]
             for fraction in self.fractions[at].tolist()
             # Frames come first: what lies between them moves with them.
             if is_whole or (at, fraction) in self._between
@@ -577,22 +608,24 @@ class SpanProgram:
         lack = sum(pulls.lack for pulls in self._pulls.values())
         return _Evaluation(corrections, is_free, between, n_apart, lack)
 
-    def _reached(self, at: int, goal: FloatArray, resolves: bool) -> bool:
-        """Collect the contacts of one frame on its way to a pose; return whether that is free."""
+    def _meet(self, at: int, goal: FloatArray, resolves: bool) -> None:
+        """Collect the contacts of one frame on its way to a colliding pose."""
         frames, frame, colliding = self.frames, self.span[at], goal
-        if frames.is_free(frame, goal):
-            self._known[at], self._is_known[at] = goal, True
-            return True
-        if resolves:
+        apart = frames.distance(self._known[at], goal) if self._is_known[at] else np.inf
+        # Frames with watched neighbours keep to their side; others look for the nearest way out.
+        is_alone = not self._watched.all() and not np.array_equal(goal, self._targets[at])
+        if apart <= _NEAR or apart == np.inf or is_alone:
+            freed, contacts = frames.polished(frame, goal)
+            if freed is not None and frames.distance(freed, goal) < apart:
+                self._known[at], self._is_known[at] = freed, True
+                self._contacts[at].append(contacts)
+                return
+        if resolves and not self._is_known[at]:
             near = frames.near(frame, goal)
-            if near is not None and (
-                not self._is_known[at]
-                or frames.distance(near, goal) < frames.distance(self._known[at], goal)
-            ):
+            if near is not None:
                 self._known[at], self._is_known[at] = near, True
         if self._is_known[at]:
-            free = self._known[at]
-            apart = frames.distance(free, colliding)
+            free, apart = self._known[at], frames.distance(self._known[at], goal)
             for _ in range(_HALVINGS):
                 if apart <= _NEAR:
                     break
@@ -602,10 +635,8 @@ class SpanProgram:
                 else:
                     colliding = middle
             self._known[at] = free
-        contacts = frames.contacts(frame, colliding)
-        if contacts is not None:
-            self._contacts[at].append(contacts)
-        return False
+        if half_spaces := frames.contacts(frame, colliding):
+            self._contacts[at].append(half_spaces)
 
     def _is_near(self, pose: FloatArray, known: FloatArray, still: float) -> bool:
         if still == 0.0:

@@ -172,7 +172,12 @@ def _minimiser(
 POLISH_ROUNDS = 6
 
 
-def polish(check: ExactCheck, problem: ResolveProblem, start: FloatArray) -> FloatArray | None:
+def polish(
+    check: ExactCheck,
+    problem: ResolveProblem,
+    start: FloatArray,
+    contacts: Contacts | None = None,
+) -> FloatArray | None:
     """Leave shallow contact by a small move.
 
     Newton's method on the depths of the contacts: each round takes the smallest move that separates
@@ -183,6 +188,7 @@ def polish(check: ExactCheck, problem: ResolveProblem, start: FloatArray) -> Flo
     ----------
     check, problem : of the pose
     start : (D,) float64 array
+    contacts : receives those met on the way, if given
 
     Returns
     -------
@@ -192,7 +198,7 @@ def polish(check: ExactCheck, problem: ResolveProblem, start: FloatArray) -> Flo
     ------
     CancelledError : the job was cancelled.
     """
-    contacts = Contacts(check)
+    contacts = contacts or Contacts(check)
     latent = start
     for _ in range(POLISH_ROUNDS):
         problem.deadline.poll()
