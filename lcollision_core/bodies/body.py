@@ -858,6 +858,7 @@ class Body(ABC):
             groups=tuple(groups),
             low=read_only(space.low),
             high=read_only(space.high),
+            at_rest=read_only(np.zeros(self.latent_size)),
             shown=read_only(np.ones(self.latent_size)),
             units=("",) * self.latent_size,
         )

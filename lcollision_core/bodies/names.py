@@ -432,6 +432,8 @@ class LatentSpace:
     ----------
     groups : 1 + K groups in the latent's order, then one of shapes if there are any
     low, high : (D,) float64 arrays, read-only: the bounds of the model's box, below and above 0
+    at_rest : (D,) float64 array, read-only: what is displayed for a code of 0, before `shown`; the
+        weights at rest of morph targets
     shown : (D,) float64 array > 0, read-only: factors from codes to displayed numbers
     units : D units of the displayed numbers, such as "°"; "" for none
     """
@@ -439,6 +441,7 @@ class LatentSpace:
     groups: tuple[LatentGroup, ...]
     low: npt.NDArray[np.float64]
     high: npt.NDArray[np.float64]
+    at_rest: npt.NDArray[np.float64]
     shown: npt.NDArray[np.float64]
     units: tuple[str, ...]
 

@@ -660,9 +660,12 @@ class RigBody(Body):
             for joint in self.space.joint_of_code.tolist()
         ]
         names += self.shape_names
-        space = super().latent_space
+        space, at_rest = super().latent_space, np.zeros(self.latent_size)
+        if (rig_shapes := self.space.rig.shapes) is not None:
+            at_rest[shapes] = rig_shapes.at_rest
         return replace(
             space,
+            at_rest=read_only(at_rest),
             groups=tuple(
                 replace(group, code_names=tuple(names[group.codes])) for group in space.groups
             ),

@@ -556,14 +556,15 @@ class SceneBody(Body):
     @cached_property
     def latent_space(self) -> LatentSpace:
         """The groups, names, colours and ranges of the codes."""
-        shown, units = np.ones(self.latent_size), [""] * self.latent_size
+        at_rest, shown = np.zeros(self.latent_size), np.ones(self.latent_size)
+        units = [""] * self.latent_size
         code_names = [""] * self.latent_size
         n_whole = self._space.group_sizes[0]
         for member, own in zip(self.standing, self._space.codes, strict=True):
             if not member.moves:
                 continue
             of_member = member.body.latent_space
-            shown[own] = of_member.shown
+            at_rest[own], shown[own] = of_member.at_rest, of_member.shown
             labels = [name for group in of_member.groups for name in group.code_names]
             for place, name, unit in zip(own.tolist(), labels, of_member.units, strict=True):
                 code_names[place] = self._in_body(member.name, name) if place < n_whole else name
@@ -581,6 +582,7 @@ class SceneBody(Body):
             (whole, *groups, *([shapes] if self.shape_names else [])),
             read_only(self._space.low),
             read_only(self._space.high),
+            read_only(at_rest),
             read_only(shown),
             tuple(units),
         )

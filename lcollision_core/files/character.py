@@ -165,6 +165,12 @@ class Shapes:
     sources: npt.NDArray[np.int64]
     deltas: csc_matrix
 
+    @property
+    def at_rest(self) -> FloatArray:
+        """(S,) weights at rest of single morph targets, from which 0 to 1 is a slider's range."""
+        weights = np.where(self.high > 1.0, 1.0 - self.high, -self.low)
+        return np.where(self.sources[:, 0] >= 0, weights, 0.0)
+
     @cached_property
     def by_row(self) -> csr_matrix:
         """`deltas` in CSR form."""

@@ -217,6 +217,7 @@ class CodeRow(HoverRow):
         self._is_trained, self._is_shape = model.is_trained, is_shape
         # Factor and unit in which the field shows a code, such as degrees.
         self._shown, self._unit = float(space.shown[code]), space.units[code]
+        self._at_rest = float(space.at_rest[code])
         # The end of a name says how the body part moves; many shapes have the same start, too.
         elide = Qt.TextElideMode.ElideLeft if is_shape else Qt.TextElideMode.ElideMiddle
         label = NameLabel(name, elide)
@@ -228,7 +229,7 @@ class CodeRow(HoverRow):
         beyond = _BEYOND * (high - low)
         self._limits = self._field_limits = low - beyond, high + beyond
         decimals = _DECIMALS if self._shown == 1.0 else _DECIMALS_OF_UNITS
-        least, most = (self._shown * limit for limit in self._limits)
+        least, most = map(self._in_field, self._limits)
         self.field = NumberBox(decimals, least, most)
         self.field.setSuffix(self._unit)
         self.field.setObjectName("code")
@@ -256,7 +257,7 @@ class CodeRow(HoverRow):
         self.slider.drag_abandoned.connect(document.motion.cancel_gesture)
         self.slider.number_wanted.connect(self._move)
         self.slider.reset_wanted.connect(lambda: document.motion.reset_code(code))
-        self.field.valueChanged.connect(lambda shown: self._move(shown / self._shown))
+        self.field.valueChanged.connect(lambda value: self._move(self._from_field(value)))
         self.field.refused.connect(lambda told: document.message.emit(f"{name}: {told}"))
 
     @staticmethod
@@ -282,12 +283,19 @@ class CodeRow(HoverRow):
             limits = min(low, number), max(high, number)
             if limits != self._field_limits:
                 # Only if changed: Qt lays out the panel again.
-                self.field.setRange(*(self._shown * limit for limit in limits))
+                self.field.setRange(*map(self._in_field, limits))
                 self._field_limits = limits
-            self.field.setValue(self._shown * number)
+            self.field.setValue(self._in_field(number))
         # The field's text has the unit, and is finer than the slider's value.
         self.slider.setAccessibleDescription(self.field.text())
         self._explain(number)
+
+    def _in_field(self, number: float) -> float:
+        """Convert a code to the number in its field."""
+        return self._shown * (number + self._at_rest)
+
+    def _from_field(self, value: float) -> float:
+        return value / self._shown - self._at_rest
 
     def _move(self, number: float) -> None:
         # NaN differs from any number, so the pose's number is shown, wherever contact stops it.
@@ -307,7 +315,7 @@ class CodeRow(HoverRow):
         self._explained = outside, is_held
         show_verdict(self.field, "outside" if outside else "")
         least, most, *limits = (
-            self.field.textFromValue(self._shown * number) + self._unit
+            self.field.textFromValue(self._in_field(number)) + self._unit
             for number in (low, high, *self._limits)
         )
         ends = {"low": least, "high": most}
@@ -326,7 +334,7 @@ class CodeRow(HoverRow):
         """Mark the number at which contact stopped the requested one; None removes the mark."""
         self.slider.show_contact_limit(number)
         self.field.setProperty("held", number is not None)
-        self._explain(self.field.value() / self._shown)
+        self._explain(self._from_field(self.field.value()))
 
     def _on_drag_started(self) -> None:
         document = self._document

@@ -99,6 +99,7 @@ def test_ranges_are_those_of_weights_and_clips(body: RigBody) -> None:
     low, high = (end[-3:] for end in (body.space.low, body.space.high))
     np.testing.assert_allclose(low, [0.0, -0.5, -0.25], atol=1e-6)
     np.testing.assert_allclose(high, [1.5, 1.0, 0.75], atol=1e-6)
+    np.testing.assert_allclose(body.latent_space.at_rest[-3:], [0.0, 0.0, 0.25], atol=1e-12)
 
 
 def test_an_expression_is_a_slider(tmp_path: Path) -> None:

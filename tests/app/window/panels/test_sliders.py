@@ -514,8 +514,15 @@ def test_shapes_of_a_face_are_sliders_of_a_folded_group(
     rest(qtbot, window)
     assert document.history.undo_stack.undoText() == "Move smile_L"
     assert row.field.text() == "150.0 %"
+    # The file's own weight is 0.25.
+    panel.filter.setText("fat")
+    of_file = panel.row_of(first + 2)
+    assert of_file.field.text() == "25.0 %"
+    of_file.field.setValue(75.0)
+    rest(qtbot, window)
     posed = document.history.latent
     assert posed[first] == pytest.approx(1.5)
+    assert posed[first + 2] == pytest.approx(0.5)
     np.testing.assert_allclose(decoded(document), model.decode(posed), atol=1e-6)
     document.motion.randomise(1.0, 3)
     rest(qtbot, window)
