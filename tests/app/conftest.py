@@ -19,6 +19,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.view import canvas
+from app.view import viewport as viewport_module
 from app.view.theme import LIGHT, apply_theme
 from app.view.viewport import Viewport
 from app.window import file_actions
@@ -32,13 +33,24 @@ from tests.app.support import STABBED
 from tests.app.views import SIDE, dispose, rest
 from tests.app.windows import (
     PATIENCE,
+    SHARED,
     begin_again,
-    close_window,
+    close_opened,
     is_open,
     open_window,
     settings_in,
 )
 from tests.small_models import SWING
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown() -> Iterator[None]:
+    """Close what a test, even a failing one, has left open, before its fixtures end."""
+    try:
+        if QApplication.instance() is not None:
+            close_opened()
+    finally:
+        yield
 
 
 class PatientBot(QtBot):
@@ -68,6 +80,8 @@ def _plain_edges(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw without multisampling, which takes long in software, and the final picture soon."""
     monkeypatch.setattr(canvas, "_SMOOTH_SAMPLES", 0)
     monkeypatch.setattr(canvas, "_REST_MILLISECONDS", 60)
+    for duration in ("_TRANSITION_MILLISECONDS", "_TURN_MILLISECONDS"):
+        monkeypatch.setattr(viewport_module, duration, 60)
 
 
 @pytest.fixture(autouse=True)
@@ -179,12 +193,9 @@ def shares_window(request: pytest.FixtureRequest) -> bool:
 @pytest.fixture(scope="module")
 def kept_windows() -> Iterator[list[MainWindow]]:
     """Return a list for the window that the tests of a module marked `one_window` share."""
-    windows: list[MainWindow] = []
-    yield windows
-    for held in filter(is_open, windows):
-        close_window(held)
-        assert held.document.close()
-        held.document.deleteLater()
+    yield SHARED
+    SHARED.clear()
+    close_opened()
 
 
 @pytest.fixture
@@ -214,7 +225,7 @@ def document(
 @pytest.fixture
 def window(
     request: pytest.FixtureRequest, qtbot: QtBot, document: PoseDocument, tmp_path: Path
-) -> Iterator[MainWindow]:
+) -> MainWindow:
     """Return a window of the document that has drawn its pose.
 
     It closes after the test, or in a module marked `one_window` after the last test.
@@ -223,12 +234,8 @@ def window(
         kept = request.getfixturevalue("kept_windows")
         if not kept or not is_open(kept[0]):
             kept[:] = [open_window(qtbot, document, settings_in(tmp_path))]
-        yield kept[0]
-        return
-    held = open_window(qtbot, document, settings_in(tmp_path))
-    yield held
-    if is_open(held):
-        close_window(held)
+        return kept[0]
+    return open_window(qtbot, document, settings_in(tmp_path))
 
 
 @pytest.fixture(scope="session")
@@ -238,15 +245,10 @@ def body(compiled_body: None) -> LearnedBody:  # noqa: ARG001
 
 
 @pytest.fixture
-def body_window(qtbot: QtBot, body: LearnedBody, tmp_path: Path) -> Iterator[MainWindow]:
+def body_window(qtbot: QtBot, body: LearnedBody, tmp_path: Path) -> MainWindow:
     """Return a window with the bundled body and a separate document."""
     document = PoseDocument(body, library_folder=tmp_path / "library")
-    held = open_window(qtbot, document, settings_in(tmp_path), (1280, 860))
-    yield held
-    if is_open(held):
-        close_window(held)
-    assert document.close()
-    document.deleteLater()
+    return open_window(qtbot, document, settings_in(tmp_path), (1280, 860))
 
 
 @pytest.fixture

@@ -58,7 +58,7 @@ def steady_pixels(qtbot: QtBot, viewport: Viewport) -> npt.NDArray[np.int64]:
     shown = [pixels(viewport)]
 
     def stays() -> bool:
-        qtbot.wait(300)
+        qtbot.wait(100)
         shown.append(pixels(viewport))
         return not changed(*shown[-2:]).any()
 

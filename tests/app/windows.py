@@ -41,6 +41,9 @@ SIZE = (1280, 800)
 PATIENCE = 120_000
 """Timeout on a busy machine, in milliseconds."""
 
+SHARED: list[MainWindow] = []
+"""The window that the tests of a module share; any other is closed after its test."""
+
 
 def settings_in(folder: Path) -> Settings:
     """Return settings that nothing else reads."""
@@ -106,6 +109,17 @@ def close_window(window: MainWindow) -> None:
     window.document.history.mark_saved()
     assert window.close()
     dispose(window)
+
+
+def close_opened() -> None:
+    """Close the menus and windows that a test has left open, and delete their documents."""
+    while (popup := QApplication.activePopupWidget()) is not None:
+        popup.close()
+    for window in QApplication.topLevelWidgets():
+        if isinstance(window, MainWindow) and window.isVisible() and window not in SHARED:
+            document = window.document
+            close_window(window)
+            document.deleteLater()
 
 
 def dispose(window: MainWindow) -> None:

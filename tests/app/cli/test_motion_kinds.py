@@ -132,24 +132,24 @@ def _of_file(path: Path, clip: str) -> list[int]:
 def test_the_frames_of_a_clip_are_checked_with_their_morph_targets(
     lcollision: Lcollision, tmp_path: Path
 ) -> None:
-    character = swinging_body()
+    character = swinging_body(24.0, 24)
     builder, body, _ = _file_of(write_gltf(character, tmp_path / "plain.glb"))
     # One leg across the other.
     rest = character.rest_vertices
     across = np.where((rest[:, :1] < 0.0) & (rest[:, 2:] < 0.8), [[0.2, 0.0, 0.0]], 0.0)
     primitive = builder.description["meshes"][0]["primitives"][0]
     primitive["targets"] = [{"POSITION": builder.array(across)}]
-    times, weights = np.arange(48) / 30.0, np.linspace(0.0, 1.0, 48)
+    times, weights = np.arange(24) / 24.0, np.linspace(0.0, 1.0, 24)
     channel = {"node": body, "path": "weights", "times": times, "values": weights}
     builder.animation("morph", channel)
     source, out = builder.write(tmp_path / "morph.glb"), tmp_path / "out.glb"
     found = _colliding(lcollision, source, "--substeps", "0")
     assert found["morph"] == _of_file(source, "morph")
-    assert 0 < len(found["morph"]) < 48
+    assert 0 < len(found["morph"]) < 24
     assert found[OTHER] == []
     result = lcollision("resolve", source, "--motion", "--clip", "morph", "-o", out, "--json")
     (row,) = json.loads(result.stdout)
-    assert row["free_before"] == 48 - len(found["morph"])
+    assert row["free_before"] == 24 - len(found["morph"])
     left = _colliding(lcollision, out, "--clip", "morph", "--substeps", "0")
     assert left["morph"] == row["colliding_frames"]
 
@@ -158,7 +158,7 @@ def test_the_frames_of_a_clip_are_checked_with_their_morph_targets(
 def test_a_prop_that_a_clip_hides_by_its_scale_collides_in_none_of_its_frames(
     lcollision: Lcollision, tmp_path: Path, clearance: str
 ) -> None:
-    plain = write_gltf(swinging_body(), tmp_path / "plain.glb")
+    plain = write_gltf(swinging_body(24.0, 20), tmp_path / "plain.glb")
     builder, _, forearm = _file_of(plain)
     vertices, faces = tube()
     primitive = {
@@ -170,7 +170,7 @@ def test_a_prop_that_a_clip_hides_by_its_scale_collides_in_none_of_its_frames(
     node = builder.add("nodes", name="Prop", mesh=mesh, **place)
     builder.description["nodes"][forearm]["children"].append(node)
     swing = builder.description["animations"][0]
-    scale = {"node": node, "path": "scale", "times": [0.0, 1.0]}
+    scale = {"node": node, "path": "scale", "times": [0.0, 0.5]}
     builder.animation("shown", scale | {"values": np.ones((2, 3))})
     builder.animation("hidden", scale | {"values": np.zeros((2, 3))})
     for animation in builder.description["animations"][2:]:
@@ -187,8 +187,8 @@ def test_a_prop_that_a_clip_hides_by_its_scale_collides_in_none_of_its_frames(
     assert len(found["shown"]) > len(bare) > 0
     options = ("--motion", "--clip", "hidden", "-o", out, "--json", *given)
     (row,) = json.loads(lcollision("resolve", source, *options).stdout)
-    assert row["free_before"] == N_FRAMES - len(bare)
-    assert row["free_after"] == N_FRAMES
+    assert row["free_before"] == 20 - len(bare)
+    assert row["free_after"] == 20
     assert _colliding(lcollision, out, "--substeps", "0")["hidden"] == []
 
 

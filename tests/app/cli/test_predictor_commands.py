@@ -65,26 +65,26 @@ def n_rows(request: pytest.FixtureRequest) -> int:
 
 
 @pytest.fixture(scope="module")
-def store(model: Path, n_rows: int) -> Path:
+def store(lcollision: Lcollision, model: Path, n_rows: int) -> Path:
     """Return the model's labelled samples."""
     path = model.with_name(f"store {n_rows}")
-    command = [sys.executable, "-m", "app", "label", model, "-n", str(n_rows), "-o", path]
-    subprocess.run(command, check=True, capture_output=True)
+    assert lcollision("label", model, "-n", n_rows, "-o", path).exit_code == 0
     return path
 
 
 @pytest.fixture(scope="module")
-def trained(model: Path, store: Path, n_rows: int) -> Path:
+def trained(lcollision: Lcollision, model: Path, store: Path, n_rows: int) -> Path:
     """Return a model with the paper's predictor, trained by the command.
 
     How well such a small predictor ranks depends on its seed; with others, on the processor too.
     """
     path = store.with_name(f"of {n_rows}") / "trained.safetensors"
     path.parent.mkdir()
-    command = [sys.executable, "-m", "app", "train", "predictor", model, store, "-o", path]
-    result = subprocess.run(
-        [*command, "--preset", "paper", "--seed", "2"], check=True, capture_output=True, text=True
-    )
+    command = ("train", "predictor", model, store, "-o", path, "--preset", "paper", "--seed", 2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scoring, "CARD_POSES", 40)
+        result = lcollision(*command)
+    assert result.exit_code == 0, result.output
     assert result.stdout == ""
     said = _without_progress(result.stderr)
     assert said.startswith(f"lcollision: wrote {path}: ")

@@ -369,6 +369,8 @@ def test_resolve_transitions_to_the_new_pose_and_leaves_a_ghost(
     assert scene is not None
     start = scene.surface.vertices.copy()
     between: list[npt.NDArray[np.float32]] = []
+    # Long enough for pictures of it on a busy machine.
+    viewport._transition.setDuration(400)
     with qtbot.waitSignal(document.tasks.solve_finished, timeout=20_000):
         document.tasks.resolve()
     viewport.painted.connect(lambda _: between.append(scene.surface.vertices.copy()))

@@ -30,7 +30,6 @@ from tests.app.support import export_pose
 from tests.app.windows import (
     PATIENCE,
     answer,
-    close_window,
     drop,
     rest,
     settings_in,
@@ -232,7 +231,6 @@ def test_the_editor_starts_with_a_character_or_without_a_damaged_one(
     start.deleteLater()
     for number, handler in handlers.items():
         signal.signal(number, handler)
-    close_window(window)
 
 
 def test_what_was_changed_on_reading_is_told_once(
@@ -323,7 +321,6 @@ def test_a_greyed_action_says_why(qtbot: QtBot, tmp_path: Path, arm_file: Path) 
     window.document.motion.set_code(7, 0.1)
     assert actions["undo"].isEnabled()
     assert actions["undo"].statusTip() == window.commands.by_key["undo"].tip
-    close_window(window)
 
 
 @pytest.mark.slow

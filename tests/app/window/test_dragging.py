@@ -24,6 +24,8 @@ from tests.app.windows import (
     take_picture,
 )
 
+pytestmark = pytest.mark.one_window
+
 LEFT, NO_KEY = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
 
 

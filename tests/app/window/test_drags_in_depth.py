@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +17,6 @@ from app.window.main_window import MainWindow
 from lcollision_core.bodies import open_body
 from tests.app.views import place_of, point_at, point_beside, roll, seen_vertex
 from tests.app.windows import (
-    close_window,
-    is_open,
     move_held,
     open_window,
     rest,
@@ -34,7 +31,7 @@ LEFT, NO_KEY = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
 @pytest.fixture
 def stage(
     qtbot: QtBot, tmp_path: Path, characters: Path, request: pytest.FixtureRequest
-) -> Iterator[MainWindow]:
+) -> MainWindow:
     """Return a window of the mannequin, seen from the front, in a theme."""
     document = PoseDocument(
         open_body(characters / "mannequin-moves.glb"), library_folder=tmp_path / "library"
@@ -45,11 +42,7 @@ def stage(
     document.motion.reset_all()
     held.viewport.set_camera("Front", animated=False)
     rest(qtbot, held)
-    yield held
-    if is_open(held):
-        close_window(held)
-    assert document.close()
-    document.deleteLater()
+    return held
 
 
 def domain_of(window: MainWindow, name: str) -> int:

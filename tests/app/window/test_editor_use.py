@@ -50,7 +50,7 @@ from tests.app.windows import (
     take_picture,
 )
 
-pytestmark = pytest.mark.usefixtures("compiled_body")
+pytestmark = [pytest.mark.one_window, pytest.mark.usefixtures("compiled_body")]
 
 ROOT = Path(__file__).parents[3]
 N_ACTIONS = int(os.environ.get("LCOLLISION_RANDOM_ACTIONS", "300"))
@@ -524,7 +524,6 @@ def test_the_layout_is_remembered(
     assert second.palette().color(QPalette.ColorRole.Window) == QColor(DARK.window)
     second.reset_layout()
     assert second.docks["library"].isVisible()
-    close_window(second)
 
 
 # Long use, and how it looks.
@@ -670,5 +669,4 @@ def test_the_built_in_body_from_colliding_to_free(
     qtbot.waitUntil(dialog.isVisible)
     take_picture(window, f"{theme.name}-error")
     dialog.reject()
-    close_window(window)
     assert application().activeModalWidget() is None

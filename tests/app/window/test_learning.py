@@ -184,9 +184,6 @@ def test_a_run_goes_on_without_its_window_and_the_next_window_finds_it(
     assert not path.exists()
     assert not dialog.isVisible()
     assert LearnedBody.load("hero").has_predictor
-    close_window(later)
-    assert document.close()
-    document.deleteLater()
 
 
 def test_a_rigged_character_offers_to_be_learned(
@@ -435,9 +432,8 @@ def test_a_failure_to_look_for_runs_is_told(
 
     monkeypatch.setattr(learning_runs, "load_learning", fail)
     with qtbot.waitSignal(document.failed, timeout=PATIENCE) as failed:
-        window = open_window(qtbot, document, settings_in(tmp_path))
+        open_window(qtbot, document, settings_in(tmp_path))
     assert failed.args[0].headline == "the list of runs cannot be read"
-    close_window(window)
 
 
 def test_the_dialog_keeps_its_size_and_does_not_come_back_once_closed(

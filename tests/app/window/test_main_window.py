@@ -624,7 +624,6 @@ def test_files_dropped_while_the_first_model_loads_wait_for_it_or_are_refused(
     assert document.history.pose.name == "bent"
     rest(qtbot, window)
     assert not failures(window)
-    close_window(window)
 
 
 def test_a_failure_says_what_happened_and_below_it_what_to_do(window: MainWindow) -> None:

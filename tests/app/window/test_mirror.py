@@ -19,7 +19,6 @@ from lcollision_core.bodies import LearnedBody, RigBody
 from lcollision_core.tasks.words import mirrored_name
 from tests.app.windows import (
     PATIENCE,
-    close_window,
     open_window,
     rest,
     settings_in,
@@ -211,4 +210,3 @@ def test_a_model_without_two_sides_offers_no_mirror(
     for key in ("mirror", "mirror_poses"):
         assert not held.actions_by_key[key].isEnabled()
         assert "do not say left and right" in held.actions_by_key[key].toolTip()
-    close_window(held)

@@ -21,7 +21,7 @@ from app.window.panels.collision import DomainRow
 from app.window.widgets import NATIVE
 from app.work.threads import Failure
 from lcollision_core.bodies import LearnedBody, sample_poses
-from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
+from tests.app.windows import PATIENCE, answer, open_window, rest, settings_in
 
 pytestmark = pytest.mark.one_window
 
@@ -30,14 +30,13 @@ HOSTILE = ("arms &hands & more", "<b>bold</b><img src=x>")
 
 
 @pytest.fixture
-def hostile(qtbot: QtBot, editor_model: LearnedBody, tmp_path: Path) -> Iterator[MainWindow]:
+def hostile(qtbot: QtBot, editor_model: LearnedBody, tmp_path: Path) -> MainWindow:
     """Return a window whose body parts, pose and undo steps have hostile names."""
     document = PoseDocument(editor_model.edit_domains(dict(enumerate(HOSTILE))))
     window = open_window(qtbot, document, settings_in(tmp_path))
     for name in HOSTILE:
         document.library.add_pose(name)
-    yield window
-    close_window(window)
+    return window
 
 
 def menu_actions(menu: QMenu) -> Iterator[QAction]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,8 +23,6 @@ from lcollision_core.posing import long_axis
 from tests.app.views import double_click, place_of
 from tests.app.windows import (
     PATIENCE,
-    close_window,
-    is_open,
     move_held,
     open_window,
     rest,
@@ -122,10 +119,16 @@ class Hand:
 
     def look_from(self, camera: str) -> None:
         """Choose a camera in the menu of the tool bar."""
-        button = self._window.findChild(QToolButton, "cameras")
-        # The button's handler continues when its menu is closed.
-        QTimer.singleShot(0, self._window, lambda: self.choose(camera))
+        button, chosen = self._window.findChild(QToolButton, "cameras"), list[str]()
+
+        def choose() -> None:
+            self.choose(camera)
+            chosen.append(camera)
+
+        # Up to Qt 6.11, the button's handler returns only once its menu is closed.
+        QTimer.singleShot(0, self._window, choose)
         QTest.mouseClick(button, LEFT)
+        self._qtbot.waitUntil(lambda: bool(chosen))
         rest(self._qtbot, self._window)
 
     def pin(self, vertex: int) -> None:
@@ -338,18 +341,13 @@ def _pixel(place: npt.NDArray[np.floating]) -> QPoint:
 @pytest.fixture
 def character_window(
     qtbot: QtBot, tmp_path: Path, characters: Path, request: pytest.FixtureRequest
-) -> Iterator[MainWindow]:
+) -> MainWindow:
     """Return a window of a character in its rest pose, with Solid on."""
     name, theme = request.param
     document = PoseDocument(open_body(characters / name), library_folder=tmp_path / "library")
     settings = settings_in(tmp_path)
     settings["theme"], settings["solid"] = theme, True
-    held = open_window(qtbot, document, settings, (1280, 860))
-    yield held
-    if is_open(held):
-        close_window(held)
-    assert document.close()
-    document.deleteLater()
+    return open_window(qtbot, document, settings, (1280, 860))
 
 
 @CHARACTERS

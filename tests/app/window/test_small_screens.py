@@ -80,7 +80,6 @@ def test_everything_is_reached_at_800_by_600(qtbot: QtBot, small: MainWindow) ->
         area.ensureWidgetVisible(row)
         assert lies_in(row.slider, area.viewport())
         assert lies_in(row.field, area.viewport())
-    close_window(small)
 
 
 @pytest.mark.variants
@@ -100,7 +99,6 @@ def test_the_note_of_the_legend_is_read_whole(
     needed = note.fontMetrics().boundingRect(room, Qt.TextFlag.TextWordWrap, note.text())
     assert needed.width() <= note.width()
     assert needed.height() <= note.height()
-    close_window(small)
 
 
 def _area_of(widget: QWidget) -> QScrollArea:
@@ -138,7 +136,6 @@ def test_what_a_narrow_tool_bar_leaves_out_is_behind_its_arrow(
         ]
         assert max(light) - min(light) > 120, theme
     assert more.toolTip()
-    close_window(small)
 
 
 @pytest.mark.variants(2)
@@ -168,7 +165,6 @@ def test_dialogs_fit_800_by_600(
     assert dialog.width() <= room.width()
     assert dialog.height() <= room.height()
     dialog.close()
-    close_window(small)
 
 
 def test_tracks_of_sliders_grow_with_their_panel(qtbot: QtBot, window: MainWindow) -> None:
@@ -207,7 +203,6 @@ def test_a_window_of_1280_by_720_is_mostly_view_and_cuts_no_readout(
     shown = row.seed.lineEdit()
     assert shown.width() >= shown.fontMetrics().horizontalAdvance("999999")
     take_picture(held, "1280x720")
-    close_window(held)
 
 
 def test_a_wide_window_has_wider_panels(
@@ -216,7 +211,6 @@ def test_a_wide_window_has_wider_panels(
     wide = open_window(qtbot, document, settings_in(tmp_path), (1580, 900))
     qtbot.waitUntil(lambda: wide.docks["sliders"].width() > 380)
     assert wide.docks["collision"].width() > 330
-    close_window(wide)
 
 
 def test_a_panel_floats_beside_the_window(
@@ -233,7 +227,6 @@ def test_a_panel_floats_beside_the_window(
         assert screen_of(held).contains(dock.frameGeometry())
         dock.setFloating(False)
         rest(qtbot, held)
-    close_window(held)
 
 
 def overlaps(dock: QDockWidget, window: MainWindow) -> bool:
@@ -293,9 +286,6 @@ def test_the_width_of_a_panel_is_the_users_and_remembered(
     settle_layout(qtbot, second)
     assert second.docks["sliders"].width() != wanted
     assert second.docks["collision"].width() >= others
-    close_window(second)
-    assert again.close()
-    again.deleteLater()
 
 
 @pytest.mark.variants
@@ -329,4 +319,3 @@ def test_resolve_is_in_sight_beside_long_lists_and_notes(
         assert lies_in(widget, window.docks["collision"])
         assert widget.visibleRegion().boundingRect().size() == widget.size()
     assert panel.resolve.button.height() >= 30
-    close_window(window)

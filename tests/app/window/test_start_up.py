@@ -14,7 +14,7 @@ from app.window.main_window import MainWindow
 from app.window.start_up import DEFAULT_MODEL, StartUp, last_model
 from app.work.threads import Failure
 from lcollision_core.bodies import LearnedBody
-from tests.app.windows import close_window, settings_in
+from tests.app.windows import settings_in
 
 
 def test_a_model_that_is_gone_gives_way_to_the_default(tmp_path: Path) -> None:
@@ -70,4 +70,3 @@ def test_a_file_without_a_skeleton_is_refused_for_what_it_is(
     qtbot.waitUntil(lambda: bool(failures))
     assert "the model 'yesterday'" in failures[0].headline
     assert "has no skeleton" not in failures[0].headline
-    close_window(window)

@@ -18,6 +18,8 @@ from tests.app.windows import PATIENCE, drop, rest, take_picture
 from tests.core.gltf_builder import GltfBuilder, arm
 from tests.core.textured_cube import BLUE, RED, add_texture, coloured, png, textured_cube
 
+pytestmark = pytest.mark.one_window
+
 HALVES = np.array([[RED, BLUE]], dtype=np.uint8)
 
 

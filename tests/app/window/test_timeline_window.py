@@ -44,6 +44,8 @@ from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import write_gltf
 
+pytestmark = pytest.mark.one_window
+
 
 @pytest.fixture
 def swinging(qtbot: QtBot, window: MainWindow, swing: Path) -> MainWindow:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ from app.window.main_window import MainWindow
 from lcollision_core.bodies import LearnedBody, change_model, user_models_folder
 from lcollision_core.tasks.changing import PartEdits
 from lcollision_core.tasks.words import heading
-from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in
+from tests.app.windows import PATIENCE, open_window, rest, settings_in
 
 pytestmark = pytest.mark.one_window
 
@@ -34,15 +33,13 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def own(qtbot: QtBot, editor_model: LearnedBody, home: Path) -> Iterator[MainWindow]:
+def own(qtbot: QtBot, editor_model: LearnedBody, home: Path) -> MainWindow:
     """Return a window of a model stored in a file of the user's."""
     editor_model.save(home / "dancer.safetensors")
     document = PoseDocument()
     document.tasks.open_model(home / "dancer.safetensors")
     qtbot.waitUntil(lambda: document.has_model and not document.tasks.busy, timeout=PATIENCE)
-    window = open_window(qtbot, document, settings_in(home))
-    yield window
-    close_window(window)
+    return open_window(qtbot, document, settings_in(home))
 
 
 def dialog_of(window: MainWindow) -> BodyPartsDialog:

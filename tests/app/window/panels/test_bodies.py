@@ -24,7 +24,7 @@ from app.window.widgets import NameLabel
 from lcollision_core.bodies import Body, as_scene, open_body
 from lcollision_core.bodies.scene_file import open_scene_file
 from lcollision_core.tasks.scenes import kept_scene, scene_of_files, with_body
-from tests.app.windows import PATIENCE, answer, close_window, drop, open_window, settings_in
+from tests.app.windows import PATIENCE, answer, drop, open_window, settings_in
 from tests.core.shapes import box
 from tests.rigged_shapes import rigged_body, write_gltf
 
@@ -87,7 +87,6 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
         assert second is not None
         second.setCheckState(3, Qt.CheckState.Unchecked)
     assert document.model.rules.left_out == ("hero 2",)
-    close_window(window)
 
 
 def test_another_body_that_is_dropped_joins_where_that_is_wanted(
@@ -118,7 +117,6 @@ def test_another_body_that_is_dropped_joins_where_that_is_wanted(
     scene = as_scene(document.model)
     assert scene is not None
     assert [member.name for member in scene.members] == ["hero", "villain", "chair"]
-    close_window(window)
 
 
 @pytest.mark.slow
@@ -167,7 +165,6 @@ def test_clips_of_a_scene_play_together_with_offsets_and_each_body_gets_its_file
     ):
         window.files.export()
     assert sorted(one.name for one in out.iterdir()) == ["moving 2.obj", "moving.obj"]
-    close_window(window)
 
 
 def lowered(body: Body) -> npt.NDArray[np.float64]:
@@ -216,7 +213,6 @@ def test_the_ground_counts_where_it_is_wanted(qtbot: QtBot, hero: Path, tmp_path
         toggle.trigger()
     assert as_scene(document.model) is None
     np.testing.assert_array_equal(document.history.latent, sunk)
-    close_window(window)
 
 
 def test_a_further_body_stands_beside_what_is_open(hero: Path) -> None:

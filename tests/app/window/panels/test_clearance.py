@@ -60,14 +60,9 @@ def test_the_field_says_the_clearance_and_the_next_window_has_it(
     field.setValue(0.25)
     assert first.document.motion.clearance == pytest.approx(0.0025)
     close_window(first)
-    assert first.document.close()
-    first.document.deleteLater()
     second = open_window(qtbot, PoseDocument(body, library_folder=tmp_path / "two"), settings)
     assert second.document.motion.clearance == pytest.approx(0.0025)
     assert second.collision.resolve.clearance.text() == "0.25 %"
-    close_window(second)
-    assert second.document.close()
-    second.document.deleteLater()
 
 
 def test_of_a_character_it_is_in_millimetres(qtbot: QtBot, body_window: MainWindow) -> None:

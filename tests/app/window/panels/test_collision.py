@@ -19,7 +19,7 @@ from app.view.theme import current_theme
 from app.window.main_window import MainWindow
 from app.work.frames import FrameEvaluator, PosePrediction
 from lcollision_core.resolve import ResolveResult
-from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in, settle_layout
+from tests.app.windows import PATIENCE, open_window, rest, settings_in, settle_layout
 
 pytestmark = pytest.mark.one_window
 
@@ -79,7 +79,6 @@ def test_the_panel_keeps_the_width_that_its_cards_need_also_where_settings_say_l
         after.resize(*size)
         settle_layout(qtbot, after)
         assert has_room(after)
-    close_window(after)
 
 
 def has_room(window: MainWindow) -> bool:

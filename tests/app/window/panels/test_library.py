@@ -39,7 +39,6 @@ from tests.app.views import double_click
 from tests.app.windows import (
     PATIENCE,
     answer,
-    close_window,
     drag,
     drop,
     is_open,
@@ -192,7 +191,6 @@ def test_story_save_changes_no_kept_pose(
     take_picture(window, f"library-{theme}-3-loaded-again")
     (saved,) = read_poses(tmp_path / "work.json", document.model)
     assert saved.latent.tobytes() == changed
-    close_window(window)
 
 
 def test_story_a_full_blend_is_saved_beside_the_kept_pose(
@@ -313,7 +311,6 @@ def test_a_tall_window_begins_with_two_rows(
 ) -> None:
     window = open_window(qtbot, document, settings_in(tmp_path), (1280, 980))
     qtbot.waitUntil(lambda: rows_in_sight(window) == 2, timeout=PATIENCE)
-    close_window(window)
 
 
 @pytest.mark.variants(2)

@@ -29,7 +29,6 @@ from tests.app.views import double_click
 from tests.app.windows import (
     PATIENCE,
     answer,
-    close_window,
     decoded,
     open_window,
     rest,
@@ -317,7 +316,6 @@ def test_a_name_is_whole_where_there_is_room_and_its_tool_tip_is_where_not(
     told = {label.text(): label.toolTip() for label in labels()}
     assert told[heading(endless)] == heading(endless)
     assert all(row.slider.width() >= 60 for row in window.sliders.groups[0].rows)
-    close_window(window)
 
 
 def folds(window: MainWindow) -> list[bool]:
