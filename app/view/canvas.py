@@ -818,35 +818,25 @@ class Mouse(QObject):
     # The camera.
 
     def _turning(self, start: QPointF) -> _Drag:
-        last = start
-
-        def turn(place: QPointF) -> None:
+        def turn(last: QPointF, place: QPointF) -> None:
             # Turn the current view: the camera may follow the body meanwhile.
-            nonlocal last
-            way, last = (place - last) * _DEGREES_PER_PIXEL, place
+            way = (place - last) * _DEGREES_PER_PIXEL
             self.camera_moved.emit(turned(self._view, way.x(), way.y()))
 
-        return turn
+        return _by_steps(start, turn)
 
     def _shifting(self, start: QPointF) -> _Drag:
-        last = start
-
-        def shift(place: QPointF) -> None:
-            nonlocal last
+        def shift(last: QPointF, place: QPointF) -> None:
             moved = shifted(self._view, _pixel(last), _pixel(place), self._size)
-            last = place
             self.camera_moved.emit(moved)
 
-        return shift
+        return _by_steps(start, shift)
 
     def _zooming(self, start: QPointF) -> _Drag:
-        heights = [start.y()]
+        def zoom(last: QPointF, place: QPointF) -> None:
+            self._zoom(start, _ZOOM_PER_PIXEL ** (place.y() - last.y()))
 
-        def zoom(place: QPointF) -> None:
-            heights.append(place.y())
-            self._zoom(start, _ZOOM_PER_PIXEL ** (heights[-1] - heights[-2]))
-
-        return zoom
+        return _by_steps(start, zoom)
 
     @property
     def _view(self) -> View:
@@ -869,6 +859,18 @@ class Mouse(QObject):
         self._zoom_anchor = (place, point, now)
         vertices, body_size = scene.surface.vertices, self._document.model.body_size
         self.camera_moved.emit(zoomed(view, point, factor, vertices, body_size))
+
+
+def _by_steps(start: QPointF, step: Callable[[QPointF, QPointF], None]) -> _Drag:
+    """Return a drag that calls `step` with the pointer's previous and present position."""
+    last = start
+
+    def move(place: QPointF) -> None:
+        nonlocal last
+        before, last = last, place
+        step(before, place)
+
+    return move
 
 
 def _pixel(place: QPointF) -> Pixel:

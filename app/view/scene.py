@@ -8,10 +8,20 @@ import numpy as np
 import numpy.typing as npt
 import pyvista as pv
 
+from app.view.actors import (
+    FaceHighlight,
+    Marks,
+    MotionMarks,
+    Outline,
+    PartShape,
+    Patch,
+    Surface,
+    TexturedBody,
+    body_actor,
+    make_actor,
+)
 from app.view.camera import VIEW_ANGLE, View
-from app.view.marks import FaceHighlight, Marks, MotionMarks, Outline, PartShape
 from app.view.shading import COLLIDING_FACE, NAMED_FACE, UNCOUNTED_FACE
-from app.view.surface import Patch, Surface, TexturedBody, body_actor, make_actor
 
 if TYPE_CHECKING:
     from app.view.shading import Theme
@@ -64,7 +74,10 @@ class Scene:
         self.selection = FaceHighlight(self.surface, model.faces, NAMED_FACE, 3)
         self._highlights = (self.uncounted, self.crossing, self.selection)
 
-        up, radius = np.eye(3)[model.up_axis], _FLOOR_RADIUS * model.body_size
+        up = np.eye(3)[model.up_axis]
+        # Several bodies stand beside each other: their floor is as wide as they are.
+        extents = np.ptp(model.without_ground(model.reference), axis=0)
+        radius = _FLOOR_RADIUS * max(model.body_size, *np.delete(extents, model.up_axis))
         disc = pv.Disc(inner=0.0, outer=radius, normal=up, c_res=96)
         self._floor = make_actor(disc, lighting=False, culling="back")
         self._shadow = make_actor(self.surface.polydata, lighting=False)

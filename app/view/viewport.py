@@ -317,9 +317,9 @@ class Viewport(QWidget):
         """
         if domain != self._highlight:
             self._highlight = domain
-            if self.scene is not None and self.canvas is not None:
+            if self.scene is not None:
                 self.scene.outline_domain(domain)
-                self.canvas.redraw()
+                self._redraw()
 
     def hide_faces(self, hidden: npt.NDArray[np.bool_] | None) -> None:
         """Hide faces, a (F,) bool array or None, until another model is opened."""
@@ -348,13 +348,11 @@ class Viewport(QWidget):
         ------
         KeyError : `name` is not a preset.
         """
-        if self.canvas is None or self.scene is None or self.shown_frame is None:
+        if self.scene is None or self.shown_frame is None:
             return
         end = self._preset(name, self.shown_frame.vertices)
         if not animated:
-            self._turn.stop()
-            self.scene.view = end
-            self.canvas.redraw()
+            self._on_camera_moved(end)
             return
         self._turn.begin(partial(interpolated, self.scene.view, end))
 
@@ -503,11 +501,10 @@ class Viewport(QWidget):
 
     @Slot()
     def _on_ghost_changed(self) -> None:
-        if self.canvas is None or self.scene is None:
-            return
-        ghost = self._document.history.ghost
-        self.scene.show_ghost(ghost, None if ghost is None else self._normals(ghost))
-        self.canvas.redraw()
+        if self.scene is not None:
+            ghost = self._document.history.ghost
+            self.scene.show_ghost(ghost, None if ghost is None else self._normals(ghost))
+            self._redraw()
 
     @Slot()
     def _set_ground(self) -> None:
@@ -515,7 +512,7 @@ class Viewport(QWidget):
 
         Poses of a learned model have no position of their own; the floor follows them.
         """
-        if self.canvas is not None and self.scene is not None:
+        if self.scene is not None:
             model = self._document.model
             is_moving = self._document.timeline.motion is not None
             level = float(model.reference[model.topology.used_vertices, model.up_axis].min())
@@ -523,15 +520,15 @@ class Viewport(QWidget):
             self.scene.set_ground(
                 level if has_place and not is_moving else None, sinks=has_place and is_moving
             )
-            self.canvas.redraw()
+            self._redraw()
 
     @Slot()
     def _on_motion_marks(self) -> None:
-        if self.canvas is not None and self.scene is not None:
+        if self.scene is not None:
             timeline = self._document.timeline
             self.scene.motion.show_skins(timeline.onion_frames())
             self.scene.motion.show_path(timeline.trail_points)
-            self.canvas.redraw()
+            self._redraw()
 
     @Slot()
     def _on_outcome_changed(self) -> None:
@@ -676,19 +673,17 @@ class Viewport(QWidget):
 
     @Slot(object)
     def _on_pose_moved(self, vertices: Float32Array) -> None:
-        if self.scene is None or self.canvas is None:
-            return
         frame = self.shown_frame
-        arrived = frame is not None and vertices is frame.vertices
-        normals = frame.normals if frame and arrived else self._normals(vertices)
-        self.scene.show(vertices, normals)
-        self.canvas.redraw()
+        if self.scene is not None and frame is not None:
+            arrived = vertices is frame.vertices
+            self.scene.show(vertices, frame.normals if arrived else self._normals(vertices))
+            self._redraw()
 
     @Slot(object)
     def _on_turned(self, view: View) -> None:
-        if self.scene is not None and self.canvas is not None:
+        if self.scene is not None:
             self.scene.view = view
-            self.canvas.redraw()
+            self._redraw()
 
     @Slot(object)
     def _on_camera_moved(self, view: View) -> None:

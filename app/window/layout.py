@@ -165,6 +165,9 @@ class Layout(QObject):
         window.setCorner(Qt.Corner.TopRightCorner, Qt.DockWidgetArea.RightDockWidgetArea)
         window.setTabPosition(Qt.DockWidgetArea.BottomDockWidgetArea, QTabWidget.TabPosition.North)
         self._place()
+        for dock in docks.values():
+            for moved in (dock.visibilityChanged, dock.topLevelChanged, dock.dockLocationChanged):
+                moved.connect(self._limit)
         # The separators between panels are drawn by the window and have no signal.
         window.installEventFilter(self)
 
@@ -213,8 +216,6 @@ class Layout(QObject):
         """Follow the window's size, and the separators between its panels."""
         if event.type() is QEvent.Type.Resize:
             self.fit()
-        elif event.type() is QEvent.Type.LayoutRequest:
-            self._limit()
         elif event.type() is QEvent.Type.MouseButtonPress:
             self._pressed = self._widths()
         elif event.type() is QEvent.Type.MouseButtonRelease:
@@ -238,6 +239,7 @@ class Layout(QObject):
         widths = self._widths_beside_view(panel_widths, _LEAST_VIEW_WIDTH)
         docks = [self._docks[key] for key in widths]
         window.resizeDocks(docks, list(widths.values()), Qt.Orientation.Horizontal)
+        self._limit()
 
     def _widths_beside_view(self, wanted: Mapping[str, int], view: int) -> dict[str, int]:
         """Return the widths of panels beside a view of this width, none below its minimum."""
@@ -247,6 +249,7 @@ class Layout(QObject):
         share = min(max(spare, 0) / max(sum(more.values()), 1), 1.0)
         return {key: int(least[key] + share * more[key]) for key in wanted}
 
+    @Slot()
     def _limit(self) -> None:
         """Limit the window's width by the view and the side panels, not by the poses."""
         sides = [self._docks[key].minimumSizeHint().width() + _LINE for key in self._widths()]

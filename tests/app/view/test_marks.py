@@ -7,8 +7,8 @@ import numpy.typing as npt
 import pytest
 from pytestqt.qtbot import QtBot
 
+from app.view.actors import PIN_RADIUS
 from app.view.camera import View, places_of, preset_view
-from app.view.marks import PIN_RADIUS
 from app.view.offscreen import PoseRenderer
 from app.view.shading import LIGHT, Shading
 from app.view.viewport import Viewport

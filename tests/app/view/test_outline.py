@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.view.marks import PartShape
+from app.view.actors import PartShape
 from lcollision_core.bodies import LearnedBody
 
 
