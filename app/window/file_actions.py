@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QObject, Qt, Signal, Slot
+from PySide6.QtCore import QObject, Qt, QTimer, Signal, Slot
 from PySide6.QtWidgets import QDialog, QFileDialog, QWidget
 
 from app.editing.history import Source, named_after
@@ -266,17 +266,27 @@ class FileActions(QObject):
             self._document.timeline.open(path)
 
     def _open_examined(self, path: Path, beside: Body | None, read: FileContent) -> None:
-        """Open an examined file: as a body if rigged, else as a motion or mesh of the open one."""
+        """Open an examined file, or ask whether it joins the open body."""
+        is_body = read is not None and not isinstance(read, AnimationAlone)
+        if is_body and beside is not None and not beside.is_of_file(path):
+            # The task must have ended, and the window must show so, before the question.
+            QTimer.singleShot(0, self, partial(self._ask_to_join, path, beside, read))
+        else:
+            self._open_read(path, read)
+
+    def _ask_to_join(self, path: Path, beside: Body, read: FileContent) -> None:
+        is_prop = isinstance(read, OtherMesh)
+        answer = ask_to_join(self._window, path.name, beside.name, is_prop)
+        if answer is Choice.SAVE:
+            self._attempt(partial(self.add_to_scene, path))
+        elif answer is Choice.DISCARD:
+            self._open_read(path, read)
+
+    def _open_read(self, path: Path, read: FileContent) -> None:
+        """Open a file that was read: a body if rigged, else a motion or mesh of the open one."""
         if isinstance(read, AnimationAlone):
             self._attempt(partial(self.open_motion, path))
-            return
-        if beside is not None and read is not None and not beside.is_of_file(path):
-            answer = ask_to_join(self._window, path.name, beside.name)
-            if answer is Choice.SAVE:
-                self._attempt(partial(self.add_to_scene, path))
-            if answer is not Choice.DISCARD:
-                return
-        if read is None or isinstance(read, OtherMesh):
+        elif read is None or isinstance(read, OtherMesh):
             is_asked = path.suffix.lower() not in CHARACTER_SUFFIXES
             self._attempt(partial(self._import_mesh, path, is_asked=is_asked))
         elif self._attempt(self.confirm_losing_changes):

@@ -37,7 +37,7 @@ from app.window.panels.library import LibraryPanel
 from app.window.panels.sliders import RandomiseRow, SlidersPanel
 from app.window.panels.timeline import TimelinePanel
 from app.work.preparing import Preparing
-from lcollision_core.tasks.words import one_line, say
+from lcollision_core.tasks.words import counted, one_line, say
 
 if TYPE_CHECKING:
     import numpy as np
@@ -252,14 +252,15 @@ class MainWindow(EditorWindow):
         for dock in self.docks.values():
             dock.widget().setEnabled(has_model)
         # A single body needs no list.
-        has_several = self.bodies.has_several
-        self.docks["bodies"].toggleViewAction().setVisible(has_several)
-        self.docks["bodies"].setVisible(has_several)
+        n_bodies = self.bodies.n_bodies
+        self.docks["bodies"].toggleViewAction().setVisible(n_bodies > 1)
+        self.docks["bodies"].setVisible(n_bodies > 1)
         # The new model's names may be longer.
         self._layout.fit()
         if has_model:
             model = self.document.model
-            self._status.show_facts(f"{model.name} · {model.n_vertices} vertices")
+            name = counted(n_bodies, "body", "bodies") if n_bodies > 1 else model.name
+            self._status.show_facts(f"{name} · {model.n_vertices} vertices")
         topology = self.document.model.topology if has_model else None
         if topology is not self._topology or topology is None:
             # Start another body with the shading last used for its kind.

@@ -182,10 +182,8 @@ def ask_about_changed_file(parent: QWidget, file: str) -> Choice:
 
 def ask_to_replace(parent: QWidget, name: str) -> bool:
     """Ask whether to replace a pose of the library."""
-    text = f"Replace “{name}” in your library?"
-    buttons = ("Replace", "", "Choose another name")
-    answer = _ask(parent, "Replace a pose", text, "Undo brings it back.", buttons, Choice.CANCEL)
-    return answer is Choice.SAVE
+    text, buttons = f"Replace “{name}” in your library?", ("Replace", "Choose another name")
+    return _confirm(parent, "Replace a pose", text, "Undo brings it back.", buttons, careful=True)
 
 
 def ask_to_switch(parent: QWidget, file: str, model: str, differs: str = "") -> bool:
@@ -199,16 +197,20 @@ def ask_to_switch(parent: QWidget, file: str, model: str, differs: str = "") -> 
     if differs:
         text = f"{file} {differs}."
     note = f"Open “{model}” with these poses?"
-    buttons = (f"Open “{menu_text(model)}”", "", "Cancel")
-    return _ask(parent, "Poses of another model", text, note, buttons) is Choice.SAVE
+    buttons = (f"Open “{menu_text(model)}”", "Cancel")
+    return _confirm(parent, "Poses of another model", text, note, buttons)
 
 
-def ask_to_join(parent: QWidget, file: str, model: str) -> Choice:
-    """Ask whether a dropped file joins the open scene (SAVE) or is opened instead (DISCARD)."""
+def ask_to_join(parent: QWidget, file: str, model: str, is_prop: bool = False) -> Choice:
+    """Ask whether a dropped file joins the open scene (SAVE) or is opened instead (DISCARD).
+
+    A prop, a mesh of another body, can only join.
+    """
     text = f"Add “{file}” to the scene of “{model}”?"
     note = "In a scene, bodies are posed, checked and resolved together."
-    buttons = ("Add to the scene", "Open instead", "Cancel")
-    return _ask(parent, "Another body", text, note, buttons, Choice.DISCARD)
+    buttons = ("Add to the scene", "" if is_prop else "Open instead", "Cancel")
+    default = Choice.SAVE if is_prop else Choice.DISCARD
+    return _ask(parent, "Another body", text, note, buttons, default)
 
 
 def ask_about_scale(parent: QWidget, file: str, found: WrongScaleError) -> bool:
@@ -218,17 +220,14 @@ def ask_about_scale(parent: QWidget, file: str, found: WrongScaleError) -> bool:
         f"{with_capital(found.headline)}. Scaled by {found.factor:.6g} it fits; an export "
         f"restores its own size."
     )
-    buttons = ("Scale and import", "", "Cancel")
-    return _ask(parent, "Another unit", text, note, buttons) is Choice.SAVE
+    return _confirm(parent, "Another unit", text, note, ("Scale and import", "Cancel"))
 
 
 def ask_to_discard(parent: QWidget, name: str) -> bool:
     """Ask whether to discard the results of an unfinished run."""
     text = f"Discard the unfinished model “{name}”?"
     note = "The files it learns from are not changed."
-    buttons = ("Discard", "", "Cancel")
-    answer = _ask(parent, "Discard a model", text, note, buttons, Choice.CANCEL)
-    return answer is Choice.SAVE
+    return _confirm(parent, "Discard a model", text, note, ("Discard", "Cancel"), careful=True)
 
 
 def wait_for_exports(parent: QWidget, document: PoseDocument, pictures: Pictures) -> bool:
@@ -280,16 +279,14 @@ def ask_to_replace_files(parent: QWidget, files: Sequence[Path]) -> bool:
             files=names,
             n=len(files) - _NAMED,
         )
-    buttons = ("Replace", "", "Cancel")
-    answer = _ask(parent, "Replace files", text, note, buttons, Choice.CANCEL)
-    return answer is Choice.SAVE
+    return _confirm(parent, "Replace files", text, note, ("Replace", "Cancel"), careful=True)
 
 
 def ask_to_turn(parent: QWidget, model: str) -> bool:
     """Ask whether to change the up axis in a model's file."""
     text = f"Make the next axis of “{model}” point up?"
     note = "This changes the model's file for good. Undo doesn't revert it."
-    return _ask(parent, "Turn upright", text, note, ("Turn", "", "Cancel")) is Choice.SAVE
+    return _confirm(parent, "Turn upright", text, note, ("Turn", "Cancel"))
 
 
 def message_box(parent: QWidget, title: str, text: str, note: str) -> QMessageBox:
@@ -310,6 +307,21 @@ def widen(box: QMessageBox) -> None:
         layout.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
         # A message box ignores its own minimum width.
         layout.addItem(QSpacerItem(_WIDTH, 0), layout.rowCount(), 0, 1, layout.columnCount())
+
+
+def _confirm(
+    parent: QWidget,
+    title: str,
+    text: str,
+    note: str,
+    buttons: tuple[str, str],
+    *,
+    careful: bool = False,
+) -> bool:
+    """Show a question with two buttons; the second is the default if `careful`."""
+    default = Choice.CANCEL if careful else Choice.SAVE
+    yes, no = buttons
+    return _ask(parent, title, text, note, (yes, "", no), default) is Choice.SAVE
 
 
 def _ask(

@@ -23,13 +23,14 @@ from PySide6.QtWidgets import (
 from app.view.theme import TIGHT
 from app.window.layout import Docking
 from app.window.widgets import described, hbox, held, labelled, push_button
+from lcollision_core.tasks.words import say
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from lcollision_core.bodies import SceneBody
 
 _NAME, _SEEN, _LOCKED, _COUNTED = range(4)
-_HEADER = ("Body", "Shown", "Locked", "Checked")
+_HEADER = ("Body", "Show", "Lock", "Check")
 _TIPS = (
     "",
     "Draw this body",
@@ -114,10 +115,10 @@ class BodiesPanel(QWidget):
         return as_scene(self._document.model) if self._document.has_model else None
 
     @property
-    def has_several(self) -> bool:
-        """Whether the scene has more than one body, not counting the ground."""
-        scene = self.scene
-        return scene is not None and sum(not one.is_ground for one in scene.members) > 1
+    def n_bodies(self) -> int:
+        """Number of bodies of the scene, not counting the ground; 1 without a scene."""
+        members = () if self.scene is None else self.scene.members
+        return max(1, sum(not member.is_ground for member in members))
 
     @Slot()
     def _follow(self) -> None:
@@ -219,7 +220,10 @@ class BodiesPanel(QWidget):
     def _count(self, scene: SceneBody, name: str, *, counted: bool) -> None:
         others = [one for one in scene.rules.left_out if one != name]
         left_out = (*others, *(name,) * (not counted))
-        self._document.tasks.set_rules(replace(scene.rules, left_out=left_out))
+        told = say("{body} is checked", body=name)
+        if not counted:
+            told = say("{body} is not checked: its collisions don't count", body=name)
+        self._document.tasks.set_rules(replace(scene.rules, left_out=left_out), told)
 
 
 def _row_of(name: str) -> QTreeWidgetItem:

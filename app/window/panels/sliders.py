@@ -191,18 +191,16 @@ class CodeRow(HoverRow):
     code : index from 0 in the latent
     index : from 0 in its group
     domain : of its group, None for the whole body's
-    name_width : width that the name takes before the slider grows beyond its minimum
 
     Attributes
     ----------
+    name : "body: name" in a scene of several bodies
     number : of the pose shown, NaN while the user changes it
     """
 
     requested = Signal(float)
 
-    def __init__(
-        self, document: PoseDocument, code: int, index: int, domain: int | None, name_width: int
-    ) -> None:
+    def __init__(self, document: PoseDocument, code: int, index: int, domain: int | None) -> None:
         model = document.model
         moved = model.code_effects[code].domain if domain is None else domain
         super().__init__(moved)
@@ -211,7 +209,7 @@ class CodeRow(HoverRow):
         self.code = code
         is_shape = code >= model.shape_codes.start
         # A shape keeps its name from the file.
-        self._name = name = model.code_names[code] if is_shape else heading(model.code_names[code])
+        self.name = name = model.code_names[code] if is_shape else heading(model.code_names[code])
         space = model.latent_space
         self._range = low, high = float(space.low[code]), float(space.high[code])
         self._is_trained, self._is_shape = model.is_trained, is_shape
@@ -220,8 +218,7 @@ class CodeRow(HoverRow):
         self._at_rest = float(space.at_rest[code])
         # The end of a name says how the body part moves; many shapes have the same start, too.
         elide = Qt.TextElideMode.ElideLeft if is_shape else Qt.TextElideMode.ElideMiddle
-        label = NameLabel(name, elide)
-        label.setMaximumWidth(name_width)
+        self._label = NameLabel(name, elide)
         self.slider = CodeSlider(
             low, high, float(space.shown[code]), model.card.domain_colours[moved]
         )
@@ -245,8 +242,9 @@ class CodeRow(HoverRow):
         tip = f"{named}: drag to move, hold Ctrl to move ten times finer, double-click to reset"
         described(self.slider, plain_tip(tip), full)
         self.field.setAccessibleName(f"{full}, number")
-        line = hbox(label, self.slider, self.field, wide=self.slider, margins=(TIGHT, 0, TIGHT, 0))
-        line.setStretchFactor(label, NAME_SHARE)
+        row = (self._label, self.slider, self.field)
+        line = hbox(*row, wide=self.slider, margins=(TIGHT, 0, TIGHT, 0))
+        line.setStretchFactor(self._label, NAME_SHARE)
         self.setLayout(line)
         self.setFixedHeight(ROW_HEIGHT)
         self.show_number(float(document.history.latent[code]))
@@ -264,6 +262,11 @@ class CodeRow(HoverRow):
     def width_beside(name: int) -> int:
         """Return the least width of a row in which a name of this width is not elided."""
         return name + LEAST_TRACK + _FIELD_WIDTH + _ARROWS_WIDTH + 2 * CLOSE + 2 * TIGHT
+
+    def show_name(self, name: str, width: int) -> None:
+        """Show a name, which takes this width before the slider grows beyond its minimum."""
+        self._label.setText(name)
+        self._label.setMaximumWidth(width)
 
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
         """Hide the arrows of the number in a narrow row, to leave space for the name."""
@@ -328,7 +331,7 @@ class CodeRow(HoverRow):
         elif outside:
             beyond = say("this one is outside the joint's range, {low} to {high}", **ends)
         words = joined(("stopped by contact" if is_held else "", words, beyond))
-        self.field.setToolTip(plain_tip(f"{self._name}: {words}"))
+        self.field.setToolTip(plain_tip(f"{self.name}: {words}"))
 
     def show_contact_limit(self, number: float | None) -> None:
         """Mark the number at which contact stopped the requested one; None removes the mark."""
@@ -460,14 +463,23 @@ class SliderGroup(QWidget):
             row.setVisible(matches_all)
         for caption in self._captions:
             caption.setVisible(not words)
+        self._name_rows(names_bodies=bool(words))
         self.setVisible(any(matches))
         return any(matches)
+
+    def _name_rows(self, *, names_bodies: bool) -> None:
+        """Show the rows' names, without those of the bodies below captions that name these."""
+        names = [row.name for row in self.rows]
+        if self._captions and not names_bodies:
+            names = [heading(name.rpartition(": ")[2]) for name in names]
+        width = longest_name(self, names)
+        for row, name in zip(self.rows, names, strict=True):
+            row.show_name(name, width)
 
     def _make_rows(self) -> None:
         from lcollision_core.bodies import as_scene
 
         document, codes = self._panel.document, self._group.codes
-        name_width = longest_name(self, map(heading, document.model.code_names[codes]))
         order: list[QWidget] = [self.header.button]
         # In a scene, the sliders of several bodies have the same names.
         names_bodies, body = self._domain is None and as_scene(document.model) is not None, ""
@@ -478,13 +490,14 @@ class SliderGroup(QWidget):
                 caption.setContentsMargins(TIGHT, TIGHT, 0, 0)
                 self._column.addWidget(caption)
                 self._captions.append(caption)
-            row = CodeRow(document, code, index, self._domain, name_width)
+            row = CodeRow(document, code, index, self._domain)
             row.hovered.connect(self._panel.domain_hovered)
             row.menu_wanted.connect(self._panel.menu_wanted)
             row.requested.connect(partial(self._panel.remember_request, row))
             self._column.addWidget(row)
             self.rows.append(row)
             order += [row.slider, row.field]
+        self._name_rows(names_bodies=False)
         for before, after in pairwise(order):
             QWidget.setTabOrder(before, after)
 

@@ -74,6 +74,14 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
     whole_body.set_open(True)
     captions = [one.text() for one in whole_body.findChildren(QLabel) if not one.isHidden()]
     assert [one for one in captions if one in ("Hero", "Hero 2")] == ["Hero", "Hero 2"]
+    # The captions name the bodies; without them, while filtered, the rows do.
+    names = [row.name for row in whole_body.rows]
+    assert names[0] == "Hero: move left"
+    assert captions.count("Move left") == 2
+    window.sliders.filter.setText("move left")
+    shown = [one.text() for one in whole_body.findChildren(QLabel) if one.isVisible()]
+    assert shown == ["Whole body", "Hero: move left", "Hero 2: move left"]
+    window.sliders.filter.clear()
     rows = [tree.topLevelItem(row) for row in range(tree.topLevelItemCount())]
     assert [row.text(0) for row in rows if row is not None] == ["hero", "hero 2"]
     second = tree.topLevelItem(1)
