@@ -413,6 +413,11 @@ class Timeline(QObject):
         return self.playback.playing
 
     @property
+    def is_reading(self) -> bool:
+        """Whether the motion that was chosen is being read."""
+        return bool(self._reading.label_of(self._choosing))
+
+    @property
     def is_of_character(self) -> bool:
         """Whether the motions are clips of the character's own file."""
         return self.file is not None and self.file == self._history.model.own_file
@@ -475,12 +480,18 @@ class Timeline(QObject):
             self.joints, self.joints_of = read.joints, Path(path)
             self.joints_unsure.emit()
             return
+        notes = () if body is history.model else body.notes
         if body is not history.model:
             if not self._tasks.may_replace():
                 return
             self._tasks.model_opened.emit(OpenedModel(body, history.model_file))
-            self.message.emit("; ".join((f"Opened {Path(path).name}", *body.notes)))
         self._open_motions(Path(path), {motion.name: motion for motion in motions})
+        text = say(
+            "Opened {file}: {motions}",
+            file=Path(path).name,
+            motions=counted(len(motions), "motion"),
+        )
+        self.message.emit(joined((text, *notes)))
         self.joints, self.joints_of = read.joints, Path(path)
         self._put(motions[0])
         if self._history.state.moment is None:

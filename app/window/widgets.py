@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from functools import partial
 from html import escape
@@ -583,6 +584,11 @@ QProgressBar::chunk {{
 def plain_tip(text: str) -> str:
     """Return a tool tip that shows a text literally, even if it looks like HTML."""
     return f"<span>{escape(text)}</span>" if "<" in text else text
+
+
+def unbroken(text: str) -> str:
+    """Keep each number and its unit on one line of a label that wraps."""
+    return re.sub(r"(?<=\d) (?=%|mm\b)", "\N{NO-BREAK SPACE}", text)
 
 
 def labelled(text: str, style: str = "", wraps: bool = False) -> QLabel:

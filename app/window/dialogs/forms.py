@@ -270,7 +270,8 @@ def resolve_form(settings: Settings, parent: QWidget, has_predictor: bool = True
 def print_form(settings: Settings, parent: QWidget) -> Form:
     """Return the form for the options of an export for 3D printing; see `print_options`."""
     form = Form("Export for 3D printing", "Choose file…", settings, parent)
-    form.add_number("print_height", "Height", " mm", 10.0, "Of the figure, without its base", 1)
+    tip = "Of the figure, without its base"
+    form.add_number("print_height", "Height", " mm", 10.0, tip, 1, strip_zeros=True)
     tip = "Open layers are made this thick; thinner walls of closed parts are reported"
     form.add_number("print_wall", "Least wall", " mm", 0.1, tip, 2, strip_zeros=True)
     ways = {
@@ -281,9 +282,9 @@ def print_form(settings: Settings, parent: QWidget) -> Form:
     tip = "What is done with meshes that have holes, as clothes and hair"
     form.add_choice("print_open_layers", "Open layers", ways, tip)
     tip = "Loose parts are joined by pins across gaps up to this"
-    form.add_number("print_join", "Join across", " mm", 0.5, tip, 1)
+    form.add_number("print_join", "Join across", " mm", 0.5, tip, 1, strip_zeros=True)
     tip = "Thickness of a round plate under the figure"
-    base = form.add_number("print_base", "Base", " mm", 0.5, tip, 1)
+    base = form.add_number("print_base", "Base", " mm", 0.5, tip, 1, strip_zeros=True)
     base.setSpecialValueText("none")
     form.add_check("print_resolve", "Resolve the pose first")
     form.add_note("One closed solid in millimetres, z up. Hidden meshes are left out.")

@@ -55,6 +55,7 @@ from app.window.widgets import (
     show_verdict,
     signals_blocked,
     title_row,
+    unbroken,
     vbox,
 )
 from lcollision_core.tasks.words import (
@@ -410,7 +411,7 @@ class Fact(QWidget):
         """Show a sentence and the icon of its answer."""
         self.answer = answer
         self.sign.show_icon(*_ICONS_OF_ANSWERS[None if self._is_aside else answer])
-        self._text.setText(sentence)
+        self._text.setText(unbroken(sentence))
 
 
 class ResolveCard(Card):
@@ -805,8 +806,7 @@ class ExactCard(PoseCard):
             # Explain why the drag goes no further.
             sentences.append(_NO_DEEPER)
         self.verdict.setText(headline)
-        # Keep the unit on the line of its number.
-        self.details.setText("\n".join(sentences).replace(" %", "\N{NO-BREAK SPACE}%"))
+        self.details.setText(unbroken("\n".join(sentences)))
         for label in (self.verdict, self.details):
             label.setToolTip(plain_tip("\n".join(tips)) if tips else "")
 

@@ -220,6 +220,9 @@ class LibraryPanel(QWidget):
         self.tags.setToolTip("Show the poses with one tag only")
         self._tag_menu = QMenu(self.tags)
         self.tags.setMenu(self._tag_menu)
+        # There are none of these before the first body.
+        for widget in (self.starter, self.of_file, self.tags):
+            widget.hide()
         self.keep, self.update_button, self.add_button = (
             _action_button(actions[key]) for key in ("keep", "update", "add")
         )

@@ -38,6 +38,7 @@ from lcollision_core.tasks.words import (
     joined,
     menu_text,
     say,
+    say_number,
     spent_text,
     with_capital,
 )
@@ -50,7 +51,7 @@ _SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0)
 _BUTTONS = ("colliding_before", "step_back", "play", "step_on", "colliding_next", "loop")
 _LARGEST_EASING = 1000
 _LEAST_WIDTH, _NARROW = 470, 650
-_BAR_WIDTH = 64
+_BAR_WIDTH, _PART_WIDTH = 64, 150
 _WHOLE_BODY = "Whole body"
 
 
@@ -92,6 +93,9 @@ class TimelinePanel(QWidget):
             self.speed.addItem(f"{100 * speed:g} %", speed)
         tip = "Whose deepest overlap the curve shows"
         self.part = described(QComboBox(minimumContentsLength=7), tip, "Deepest overlap of")
+        # Names of a scene's parts are long, and differ at their ends.
+        self.part.setMaximumWidth(_PART_WIDTH)
+        self.part.view().setTextElideMode(Qt.TextElideMode.ElideLeft)
         tip = "Frames (at 30 per second) over which an edit eases in and out"
         self.easing = described(NumberBox(0, 0, _LARGEST_EASING), tip, "Ease edits over")
         tip = "The frame at the playhead, from 0, and its time"
@@ -106,7 +110,7 @@ class TimelinePanel(QWidget):
         self.keep = push_button("Keep so far", tip, resolving.keep_done)
         tip = "Stop Resolve and leave the motion as it was (Escape)"
         self.cancel = push_button("Cancel", tip, resolving.cancel)
-        self._second = QTimer(self, interval=1000)
+        self._second, self._play = QTimer(self, interval=1000), actions["play"]
         self._lay_out(actions)
         timeline = self._timeline
         self.strip.frame_wanted.connect(timeline.go_to)
@@ -255,6 +259,7 @@ class TimelinePanel(QWidget):
         with signals_blocked(self.speed), signals_blocked(self.easing):
             self.speed.setCurrentIndex(self.speed.findData(timeline.playback.speed))
             self.easing.setValue(timeline.easing)
+        give_icon(self._play, "pause" if timeline.playing else "play")
         self._follow_frame()
         if not timeline.playing:
             self._tell_checks()
@@ -315,19 +320,21 @@ class TimelinePanel(QWidget):
             self.facts.setText(self._tell_progress(progress))
             return
         if timeline.motion is None:
-            self.facts.setText("")
+            self.facts.setText("Reading the motion…" if timeline.is_reading else "")
             return
         checks = timeline.shown_checks
         n = len(checks.deepest)
         deep = np.nan_to_num(checks.deepest)
         n_colliding, n_between = int((deep > 0.0).sum()), int(checks.between.sum())
-        frames, facts = counted(n, "frame"), ["no collisions"]
+        frames, facts, are_all = counted(n, "frame"), ["no collisions"], checks.n_checked == n
         if n_colliding:
+            colliding = say("{n} of {frames}", n=n_colliding, frames=frames)
             facts = [
-                say(
-                    "{n} of {frames} collide, at most {depth:.1f} % deep",
-                    n=n_colliding,
-                    frames=frames,
+                say_number(
+                    n_colliding,
+                    "{frames} collides, at most {depth:.1f} % deep",
+                    "{frames} collide, at most {depth:.1f} % deep",
+                    frames=colliding if are_all else n_colliding,
                     depth=100.0 * deep.max(),
                 )
             ]
@@ -335,7 +342,7 @@ class TimelinePanel(QWidget):
             collisions = counted(n_between, "collision")
             facts.append(say("{mark} {n} between frames", mark=BETWEEN, n=collisions))
         heads = ["as it was read"] if timeline.comparing else []
-        if checks.n_checked < n and (checks.n_checked or not heads):
+        if not are_all and (checks.n_checked or not heads):
             heads.append(say("{n} of {frames} checked", n=checks.n_checked, frames=frames))
         if checks.n_checked:
             heads.append(joined(facts))
@@ -346,7 +353,7 @@ class TimelinePanel(QWidget):
             frames = counted(n, "frame")
             if left_out.step > 1:
                 searched = counted(left_out.searched, "frame")
-                frames = say("{n} of {frames}", n=n, frames=searched)
+                frames = say("{n} of {frames} searched", n=n, frames=searched)
             line = say(
                 "Pairs not counted in {frames}, up to {depth:.2f} %", frames=frames, depth=depth
             )

@@ -94,8 +94,10 @@ def test_keys_in_the_view_move_the_playhead(swinging: MainWindow) -> None:
     assert (timeline.first, timeline.last) == (first, first + 1)
     press(Qt.Key.Key_Space)
     assert timeline.playing
+    assert swinging.actions_by_key["play"].property("drawing") == "pause text"
     press(Qt.Key.Key_Space)
     assert not timeline.playing
+    assert swinging.actions_by_key["play"].property("drawing") == "play text"
 
 
 def test_keys_stay_those_of_fields(swinging: MainWindow) -> None:
