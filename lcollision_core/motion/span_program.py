@@ -227,7 +227,10 @@ SMOOTHNESS = 300.0
 """w at 30 frames a second: the weight of acceleration relative to displacement. A third of it stays
 nearer to the motion and adds a tenth to its acceleration."""
 
-ROUNDS = 22
+ROUNDS, _FEW_ROUNDS = 22, 4
+"""Most rounds of a search, and of one that goes on from fewer frames: what is left is searched
+anew from there."""
+
 _LEFT_BY_ROUND = 0.96
 """Share of the remaining work that a round is reported to leave."""
 
@@ -440,13 +443,13 @@ class SpanProgram:
         """
         n = len(self._targets)
         corrections = np.zeros(self._targets.shape) if begin is None else begin.corrections
-        start = self._evaluate(corrections, {}, resolves=False)
+        start = self._evaluate(corrections, {}, resolves=begin is not None)
         if start.score == 0.0 and not start.n_apart:
             return start
         pinned: dict[int, FloatArray] = {}
         kernel, now, best = self._kernel(pinned), start, start
         least, n_stalled = start.lack, 0
-        for number in range(ROUNDS):
+        for number in range(ROUNDS if begin is None else _FEW_ROUNDS):
             # Two pinned neighbours would leave a pose between them no way out.
             released = [at for at in now.between if at in pinned and (at + 1) % n in pinned]
             for at in released:
@@ -559,7 +562,8 @@ class SpanProgram:
         self._was_free[asked] = verdicts
         now_free, colliding = (list(np.compress(side, asked)) for side in (verdicts, ~verdicts))
         self._known[now_free], self._is_known[now_free] = poses[now_free], True
-        for _ in frames.pool.map(lambda at: self._meet(at, poses[at], resolves), colliding):
+        known = {int(at): self._known[at].copy() for at in np.flatnonzero(self._is_known)}
+        for _ in frames.pool.map(lambda at: self._meet(at, poses[at], known, resolves), colliding):
             pass
         is_free = np.ones(n, dtype=np.bool_)
         is_free[colliding] = False
@@ -608,22 +612,31 @@ class SpanProgram:
         lack = sum(pulls.lack for pulls in self._pulls.values())
         return _Evaluation(corrections, is_free, between, n_apart, lack)
 
-    def _meet(self, at: int, goal: FloatArray, resolves: bool) -> None:
-        """Collect the contacts of one frame on its way to a colliding pose."""
+    def _meet(
+        self, at: int, goal: FloatArray, known: Mapping[int, FloatArray], resolves: bool
+    ) -> None:
+        """Collect the contacts of one frame on its way to a colliding pose.
+
+        Parameters
+        ----------
+        known : free poses, by frame
+        """
         frames, frame, colliding = self.frames, self.span[at], goal
         apart = frames.distance(self._known[at], goal) if self._is_known[at] else np.inf
         # Frames with watched neighbours keep to their side; others look for the nearest way out.
         is_alone = not self._watched.all() and not np.array_equal(goal, self._targets[at])
-        if apart <= _NEAR or apart == np.inf or is_alone:
+        if is_alone or apart == np.inf:
             freed, contacts = frames.polished(frame, goal)
             if freed is not None and frames.distance(freed, goal) < apart:
                 self._known[at], self._is_known[at] = freed, True
                 self._contacts[at].append(contacts)
                 return
-        if resolves and not self._is_known[at]:
-            near = frames.near(frame, goal)
-            if near is not None:
-                self._known[at], self._is_known[at] = near, True
+        if not self._is_known[at]:
+            free_pose = self._free_beside(at, goal, known)
+            if free_pose is None and resolves:
+                free_pose = frames.near(frame, goal)
+            if free_pose is not None:
+                self._known[at], self._is_known[at] = free_pose, True
         if self._is_known[at]:
             free, apart = self._known[at], frames.distance(self._known[at], goal)
             for _ in range(_HALVINGS):
@@ -637,6 +650,26 @@ class SpanProgram:
             self._known[at] = free
         if half_spaces := frames.contacts(frame, colliding):
             self._contacts[at].append(half_spaces)
+
+    def _free_beside(
+        self, at: int, goal: FloatArray, known: Mapping[int, FloatArray]
+    ) -> FloatArray | None:
+        """Return the nearest pose or correction of neighbours that frees a frame, or None."""
+        frames, poses = self.frames, []
+        for neighbour in (
+            max((n for n in known if n < at), default=None),
+            min((n for n in known if n > at), default=None),
+        ):
+            if neighbour is not None:
+                correction = known[neighbour] - self._targets[neighbour]
+                poses += [self._targets[at] + correction, known[neighbour]]
+        poses = [np.clip(pose, self._low[at], self._high[at]) for pose in poses]
+        free = [
+            pose
+            for pose in poses
+            if frames.is_near_enough(self.span[at], pose) and frames.is_free(self.span[at], pose)
+        ]
+        return min(free, key=lambda pose: frames.distance(pose, goal), default=None)
 
     def _is_near(self, pose: FloatArray, known: FloatArray, still: float) -> bool:
         if still == 0.0:
