@@ -17,7 +17,7 @@ from lcollision_core.files.gltf.clips import ClipTracks, Track, driven_property
 from lcollision_core.files.gltf.schema import PARTS, GltfDocument, stored_parts
 from lcollision_core.files.scene.joined import JoinedMesh, join_parts
 from lcollision_core.files.scene.scene import Scene, by_node
-from lcollision_core.files.scene.transforms import unit_quaternions
+from lcollision_core.files.scene.transforms import are_regular, unit_quaternions
 from lcollision_core.files.scene_files import as_file_error, scene_of
 from lcollision_core.meshes.topology import FloatArray
 
@@ -175,7 +175,13 @@ def _unscaled(turns: FloatArray, sizes: FloatArray) -> FloatArray:
 
 
 def _local_turns(rig: Rig, change: ChangedClip) -> FloatArray:
-    """Return the additional turn of each joint in its local frame: (n, J, 4, 4)."""
+    """Return the additional turn of each joint in its local frame: (n, J, 4, 4).
+
+    None where a frame scales the joint to nothing.
+    """
+    flat = ~are_regular(change.before)
+    before, after = change.before.copy(), change.after.copy()
+    before[flat] = after[flat] = np.eye(4)
 
     def local(transforms: FloatArray) -> FloatArray:
         parents = rig.own_parents
@@ -183,7 +189,9 @@ def _local_turns(rig: Rig, change: ChangedClip) -> FloatArray:
         above[:, parents < 0] = np.eye(4)
         return np.linalg.solve(above, transforms).astype(np.float64)
 
-    return np.linalg.solve(local(change.before), local(change.after)).astype(np.float64)
+    turns = np.linalg.solve(local(before), local(after)).astype(np.float64)
+    turns[flat] = np.eye(4)
+    return turns
 
 
 def _put(patch: GltfDocument, animation: dict[str, Any], node: int, track: Track) -> None:

@@ -102,6 +102,33 @@ def test_rotations_of_any_length_are_read_back_as_they_were_read(tmp_path: Path)
         assert np.abs(frames[frame] - body.decode(codes[frame])).max() < 1e-5 * body.body_size
 
 
+def test_a_joint_that_some_frames_scale_to_nothing_stays_there_and_turns_elsewhere(
+    tmp_path: Path,
+) -> None:
+    source = write_gltf(swinging_body(), tmp_path / "body.glb")
+    document = GltfDocument(source.read_bytes(), source).editable()
+    elbow = [node.get("name") for node in document.objects("nodes")].index("LeftForeArm")
+    scales = np.ones((N_FRAMES, 3))
+    hidden = [SPAN[4], SPAN[5]]
+    scales[hidden] = 0.0
+    swing = document.description["animations"][0]
+    times = swing["samplers"][0]["input"]
+    swing["samplers"].append({"input": times, "output": document.add_array(scales)})
+    target = {"node": elbow, "path": "scale"}
+    swing["channels"].append({"sampler": len(swing["samplers"]) - 1, "target": target})
+    source.write_bytes(document.encoded())
+    body = RigBody.of(read_character(source))
+    changed, codes = change(body, [SPAN])
+    below = [name.startswith(("LeftForeArm", "LeftHand")) for name in body.space.rig.joint_names]
+    for transforms in (changed.before, changed.after):
+        transforms[np.ix_([4, 5], np.flatnonzero(below), range(3), range(3))] = 0.0
+    data = changed_gltf(body.character, [changed])
+    frames = list(FileClips.read(data, source).vertices(CLIP, changed.times))
+    for frame in set(SPAN) - set(hidden):
+        assert np.abs(frames[frame] - body.decode(codes[frame])).max() < 1e-5 * body.body_size
+    assert all(np.isfinite(frames[frame]).all() for frame in hidden)
+
+
 def test_what_is_changed_has_one_channel_and_no_matrix(tmp_path: Path) -> None:
     source = write_gltf(swinging_body(), tmp_path / "body.glb")
     document = GltfDocument(source.read_bytes(), source).editable()
