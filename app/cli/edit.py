@@ -10,6 +10,7 @@ import typer
 from app.cli.contacts import keep_rules
 from app.cli.options import takes_options
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files.table import POSES_SUFFIX
 from lcollision_core.options import NO_CHANGE, RuleOptions
 
 
@@ -37,13 +38,17 @@ def edit(
     Options of contact rules change those of the character, which keeps them: see `contacts`.
     """
     from app.window.editor import open_editor
-    from lcollision_core.tasks.scenes import is_scene_file, kept_scene, scene_of_files
 
     file = files[0] if files else None
     if files and len(files) > 1:
+        from lcollision_core.tasks.scenes import kept_scene, scene_of_files
+
         file, model_name = None, str(kept_scene(scene_of_files(files)))
-    elif file is not None and is_scene_file(file):
-        file, model_name = None, str(file)
+    elif file is not None and file.suffix.lower() == POSES_SUFFIX:
+        from lcollision_core.bodies.scene_file import is_scene_file
+
+        if is_scene_file(file):
+            file, model_name = None, str(file)
     if file is not None and not file.is_file() and not file.is_dir():
         advice = "name a file of poses, a character, a mesh or a model, or none to start a new pose"
         raise LCollisionError("is not there", advice, where=file)

@@ -205,9 +205,9 @@ class FileActions(QObject):
         ------
         LCollisionError : the extension is not supported, or the file does not exist.
         """
+        from lcollision_core.bodies.scene_file import is_scene_file
         from lcollision_core.files.motion.generated import is_generated
         from lcollision_core.files.motion.smpl import is_smpl_motion
-        from lcollision_core.tasks.scenes import is_scene_file
 
         self._dropped = None
         suffix = path.suffix.lower()

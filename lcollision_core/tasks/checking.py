@@ -6,34 +6,48 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.bodies import (
+    Body,
+    MeshBody,
+    RigBody,
+    character_of_mesh,
+    estimated_free,
+    open_body,
+)
+from lcollision_core.bodies.motions import ground_facts, is_of_skeleton, read_motions
+from lcollision_core.bodies.partners import with_joint_map
+from lcollision_core.bodies.scene_file import body_of_scene, is_scene_file
 from lcollision_core.compiled import working_seconds
 from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
-from lcollision_core.files import audit_mesh, read_mesh, read_pose_set
+from lcollision_core.files import Mesh, audit_mesh, read_mesh, read_pose_set
 from lcollision_core.files.animated import frame_rate
 from lcollision_core.files.motion.generated import is_generated
 from lcollision_core.files.safe import write_table
+from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene_files import open_rigged, read_scene
 from lcollision_core.files.table import ANIMATED_SUFFIXES, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes import STRICT
+from lcollision_core.meshes import STRICT, ContactRules, FaceGroup, Topology
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
+from lcollision_core.motion import (
+    NOMINAL_RATE,
+    Motion,
+    ScreenedMotion,
+    contact_report,
+    screen_frames,
+    screen_motion,
+)
 from lcollision_core.options import NO_SCENE, MotionChoice, RuleOptions, SceneOptions
 from lcollision_core.tasks.inputs import body_of_motion
-from lcollision_core.tasks.scenes import is_scene_file, parts_text, scene_motion, scene_of
+from lcollision_core.tasks.scenes import parts_text, scene_motion, scene_of
 from lcollision_core.tasks.verdicts import CheckedClip, CheckedFrame, CheckedMesh
 from lcollision_core.tasks.words import say, say_number
-
-if TYPE_CHECKING:
-    from lcollision_core.bodies import Body, MeshBody, RigBody
-    from lcollision_core.files import Mesh
-    from lcollision_core.meshes import ContactRules, FaceGroup, Topology
-    from lcollision_core.motion import Motion, ScreenedMotion
 
 _DEEPEST = 100
 """Most pairs of faces that are listed individually."""
@@ -94,8 +108,6 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
     LCollisionError : the file cannot be read, or its faces differ from the rest pose's.
     CancelledError : the job was cancelled.
     """
-    from lcollision_core.bodies import MeshBody
-
     if request.scene.has_others or is_scene_file(path):
         return _check_scene(path, request, job)
     start, rest = working_seconds(), request.rest_mesh
@@ -127,9 +139,6 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
 
 def _check_scene(path: Path, request: CheckRequest, job: Job) -> CheckedMesh:
     """Check meshes placed in a scene, each by the rules of its own character."""
-    from lcollision_core.bodies import MeshBody, open_body
-    from lcollision_core.bodies.scene_file import body_of_scene
-
     start, scene = working_seconds(), scene_of(str(path), request.scene)
     bodies: list[Body] = []
     posed: list[npt.NDArray[np.float64]] = []
@@ -219,10 +228,6 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
     LCollisionError : the file cannot be read or has no clip, or its body needs no `rest`.
     CancelledError : the job was cancelled.
     """
-    from lcollision_core.bodies import open_body
-    from lcollision_core.bodies.partners import with_joint_map
-    from lcollision_core.bodies.scene_file import body_of_scene
-
     if request.scene.has_others or is_scene_file(path):
         scene = _as_asked(body_of_scene(scene_of(str(path), request.scene)), request)
         motion, _ = scene_motion(scene, request.scene.played, request.motion, job)
@@ -243,8 +248,6 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
 
 def _check_poses(body: Body, path: Path, request: CheckRequest, job: Job) -> list[CheckedClip]:
     """Check motions of a body's poses."""
-    from lcollision_core.bodies.motions import read_motions
-
     if request.rest is not None:
         what = f"--rest is for motions of meshes, and {body.name} has a rest pose of its own"
         raise MeshFileError(what, "leave it out", where=path)
@@ -257,10 +260,6 @@ def _check_motions(
     body: Body, motions: Sequence[Motion], path: Path, request: CheckRequest, job: Job
 ) -> list[CheckedClip]:
     """Check motions of a body by its rules."""
-    from lcollision_core.bodies import estimated_free
-    from lcollision_core.bodies.motions import ground_facts
-    from lcollision_core.motion import contact_report, screen_motion
-
     check, choice = body.exact_check(clearance=request.clearance), request.motion
     verdicts = []
     for motion in motions:
@@ -294,10 +293,6 @@ def _check_motions(
 
 def _check_meshes(path: Path, request: CheckRequest, job: Job) -> list[CheckedClip]:
     """Check a file whose frames are meshes; without a rig, parts are components."""
-    from lcollision_core.bodies import MeshBody
-    from lcollision_core.bodies.motions import is_of_skeleton
-    from lcollision_core.motion import NOMINAL_RATE, screen_frames
-
     suffix, choice = path.suffix.lower(), request.motion
     if is_of_skeleton(path) or is_generated(path):
         what = "is the motion of a skeleton, without a body"
@@ -435,8 +430,6 @@ def _as_asked(body: _AnyBody, request: CheckRequest) -> _AnyBody:
 
 def _groups(path: Path, topology: Topology, request: CheckRequest) -> tuple[FaceGroup, ...]:
     """Return the meshes and materials named in a scene's file, if its faces match."""
-    from lcollision_core.files.scene.joined import join_parts
-
     is_asked = request.rules.name_groups or request.touch
     if not is_asked or path.suffix.lower() not in SCENE_SUFFIXES:
         return ()
@@ -446,8 +439,6 @@ def _groups(path: Path, topology: Topology, request: CheckRequest) -> tuple[Face
 
 def _character(path: Path, mesh: Mesh, job: Job) -> tuple[RigBody, npt.NDArray[np.float64]] | None:
     """Return the character of a mesh file, with its rules, and the pose; None if there is none."""
-    from lcollision_core.bodies import character_of_mesh
-
     try:
         return character_of_mesh(path, mesh)
     except LCollisionError as error:

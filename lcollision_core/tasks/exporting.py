@@ -6,13 +6,41 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.bodies import (
+    Body,
+    NamedPose,
+    SceneBody,
+    SourceFile,
+    WrittenPose,
+    as_scene,
+    export_frame,
+    remember_file,
+    requested_form,
+    sequence_files,
+    source_for,
+    unique_names,
+    write_pose,
+    write_poses,
+    write_sequence,
+)
+from lcollision_core.bodies.motions import (
+    MotionChange,
+    character_of_motion,
+    is_of_skeleton,
+    is_retargeted,
+    write_clips,
+    write_new_clips,
+)
+from lcollision_core.bodies.retargeting import require_skeleton
+from lcollision_core.bodies.scene_body import SceneMember
 from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.files import (
+    FileStamp,
     as_stored,
     atomic_files,
     file_stamp,
@@ -22,6 +50,7 @@ from lcollision_core.files import (
     require_writable,
     unused_name,
 )
+from lcollision_core.files.character_writing import require_written
 from lcollision_core.files.table import (
     BVH_SUFFIX,
     OWN_SUFFIXES,
@@ -31,18 +60,13 @@ from lcollision_core.files.table import (
     WRITABLE_SUFFIXES,
 )
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
+from lcollision_core.motion import KeptSpan, Motion, Reason
+from lcollision_core.motion.motion import runs
 from lcollision_core.options import MODELS_OWN, ExportAxes, ExportRequest
+from lcollision_core.posing import PoseSpace
+from lcollision_core.resolve import ResolveResult
+from lcollision_core.tasks.verdicts import ResolvedClip
 from lcollision_core.tasks.words import counted, exported_text, say, say_number
-
-if TYPE_CHECKING:
-    from lcollision_core.bodies import Body, NamedPose, SceneBody, SourceFile, WrittenPose
-    from lcollision_core.bodies.motions import MotionChange
-    from lcollision_core.bodies.scene_body import SceneMember
-    from lcollision_core.files import FileStamp
-    from lcollision_core.motion import Motion
-    from lcollision_core.posing import PoseSpace
-    from lcollision_core.resolve import ResolveResult
-    from lcollision_core.tasks.verdicts import ResolvedClip
 
 
 @dataclass(frozen=True)
@@ -167,8 +191,6 @@ def _status(path: Path) -> os.stat_result | None:
 
 def source_files(model: Body, request: ExportRequest | None = None) -> list[Path]:
     """Return the user's files that a body, and the form of its exports, come from."""
-    from lcollision_core.bodies import as_scene
-
     files, scene = [None if request is None else request.like, model.own_file], as_scene(model)
     if scene is not None:
         files += [member.body.own_file for member in scene.members]
@@ -180,8 +202,6 @@ def files_of(
     output: Output, model: Body, poses: Sequence[NamedPose], request: ExportRequest
 ) -> list[Path]:
     """Return the files that `write_result` writes for some poses, except for frames."""
-    from lcollision_core.bodies import as_scene
-
     if output.form != "folder":
         return [output.path]
     stems, scene = file_stems(pose.name for pose in poses), as_scene(model)
@@ -222,8 +242,6 @@ def require_request(
     PoseSetError : the file of `like` belongs to another body.
     LCollisionError : several poses go to one mesh file, or mesh options are given for codes.
     """
-    from lcollision_core.bodies import requested_form, source_for
-
     require_one_mesh(output, len(poses))
     if output.form == "poses":
         if request != ExportRequest(mesh_format=request.mesh_format, fps=request.fps):
@@ -281,15 +299,6 @@ def write_result(
     ------
     LCollisionError : a file or folder cannot be written.
     """
-    from lcollision_core.bodies import (
-        WrittenPose,
-        as_scene,
-        sequence_files,
-        write_pose,
-        write_poses,
-        write_sequence,
-    )
-
     if vertices is None:
         vertices = (model.exported_vertices(pose.latent, pose.placement) for pose in poses)
     if output.form == "folder" and (scene := as_scene(model)) is not None:
@@ -352,8 +361,6 @@ def write_result(
 
 def _remember(model: Body, output: Output, job: Job) -> None:
     """Remember the file of a character whose meshes were written, so that `check` knows it."""
-    from lcollision_core.bodies import remember_file
-
     if model.own_file is not None and output.form != "poses":
         try:
             remember_file(model, model.own_file)
@@ -395,8 +402,6 @@ def export(
     The result of Resolve is written with the vertices of its `outcome`; other frames of a motion
     use the body in that frame, `own`. Returns a sentence for the status bar.
     """
-    from lcollision_core.bodies import source_for, write_pose
-
     placement = pose.placement
     if outcome is not None and np.array_equal(outcome.latent, pose.latent):
         vertices = outcome.vertices
@@ -421,8 +426,6 @@ def frame_files(
     model: Body, path: Path, request: ExportRequest, _: Job
 ) -> tuple[list[Path], SourceFile | None]:
     """Return the files that `export_frames` writes, one per mesh of the source file, and that."""
-    from lcollision_core.bodies import sequence_files, source_for
-
     source = source_for(path.suffix, model, request.like)
     return list(sequence_files(path, model, source)), source
 
@@ -439,8 +442,6 @@ def export_frames(
 
     By default, `source` is read from the user's file. Returns a sentence for the status bar.
     """
-    from lcollision_core.bodies import source_for, write_sequence
-
     check = model.exact_check()
 
     def frames() -> Iterator[npt.NDArray[np.floating]]:
@@ -484,9 +485,6 @@ def export_clips(
     -------
     told : a sentence for the status bar
     """
-    from lcollision_core.bodies.motions import MotionChange, write_clips
-    from lcollision_core.motion.motion import runs
-
     written = write_clips(
         path,
         model,
@@ -514,8 +512,6 @@ def motion_outputs(
     folder : of the results
     root : input folder; its subfolders are kept
     """
-    from lcollision_core.bodies import unique_names
-
     by_folder: dict[Path, list[tuple[Path, str]]] = {}
     for path in files:
         suffix = path.suffix.lower()
@@ -540,8 +536,6 @@ def _keeps_skeleton(body: Body, file: Path) -> bool:
 
     A retargeted SMPL motion cannot hold the body's joints.
     """
-    from lcollision_core.bodies.motions import is_of_skeleton, is_retargeted
-
     suffix = file.suffix.lower()
     is_own = suffix in OWN_SUFFIXES and is_of_skeleton(file)
     return is_own and (suffix == BVH_SUFFIX or not is_retargeted(body, file))
@@ -560,10 +554,6 @@ def require_motions(
     output: Output, body: Body, files: Sequence[Path], motions: Sequence[Motion]
 ) -> None:
     """Raise early if an output cannot hold the motions."""
-    from lcollision_core.bodies.motions import character_of_motion, is_retargeted
-    from lcollision_core.bodies.retargeting import require_skeleton
-    from lcollision_core.files.character_writing import require_written
-
     suffix = output.path.suffix.lower()
     if output.form == "frames":
         require_skeleton(output.path, body)
@@ -604,8 +594,6 @@ def write_motions(
     job: Job,
 ) -> None:
     """Write motions, and update their rows by the check of the output."""
-    from lcollision_core.bodies import NamedPose, unique_names
-
     if output.form == "mesh":
         _write_clips(output, body, file, changes, rows, job)
         return
@@ -657,9 +645,6 @@ def _count_stuck(
     collides : (T,) verdicts of the output
     put_back : frames that were written unchanged
     """
-    from lcollision_core.motion import KeptSpan, Reason
-    from lcollision_core.motion.motion import runs
-
     row.colliding_frames = sorted({*row.colliding_frames, *np.flatnonzero(collides).tolist()})
     row.free_after = row.frames - len(row.colliding_frames)
     named = np.zeros(row.frames, dtype=np.bool_)
@@ -682,8 +667,6 @@ def _write_clips(
     job: Job,
 ) -> None:
     """Write the character's file with changed clips, or with retargeted motions as new ones."""
-    from lcollision_core.bodies.motions import is_retargeted, write_clips, write_new_clips
-
     with locked(output.path):
         path = output.path
         if file_stamp(path) != output.before:
@@ -726,8 +709,6 @@ def write_members(
     ------
     MeshFileError : a file cannot be written.
     """
-    from lcollision_core.bodies import WrittenPose, export_frame, source_for, write_pose
-
     stems = file_stems(pose.name for pose in poses) if len(poses) > 1 else [""]
     written, n_files = [], 0
     with atomic_files(folder) as unfinished:

@@ -6,11 +6,21 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.bodies import (
+    Body,
+    NamedPose,
+    encode_mesh,
+    name_of_file,
+    open_body,
+    read_model_mesh,
+    read_poses,
+    unique_names,
+)
+from lcollision_core.bodies.motions import body_of_motion as shaped
 from lcollision_core.errors import (
     LCollisionError,
     MeshFileError,
@@ -18,7 +28,7 @@ from lcollision_core.errors import (
     PoseSetError,
     WrongScaleError,
 )
-from lcollision_core.files import mesh_files
+from lcollision_core.files import PoseSet, mesh_files
 from lcollision_core.files.mesh_file import KEEP_PRECISION
 from lcollision_core.files.motion.generated import holds_joints, is_generated
 from lcollision_core.files.motion.smpl import array_names, is_smpl_motion
@@ -31,15 +41,10 @@ from lcollision_core.files.table import (
     SKELETON_SUFFIXES,
 )
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.tasks.exporting import write_result
+from lcollision_core.options import RuleOptions
+from lcollision_core.tasks.exporting import Output, write_result
 from lcollision_core.tasks.job import run_of_poses
 from lcollision_core.tasks.words import fit_error, say, say_number
-
-if TYPE_CHECKING:
-    from lcollision_core.bodies import Body, NamedPose
-    from lcollision_core.files import PoseSet
-    from lcollision_core.options import RuleOptions
-    from lcollision_core.tasks.exporting import Output
 
 _OF_MOTIONS = (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES)
 
@@ -180,8 +185,6 @@ def _has_clips(path: Path) -> bool:
 
 def body_of_motion(body: Body, path: Path, job: Job) -> Body:
     """Return the body in the shape of a motion, and note what of the motion is left out."""
-    from lcollision_core.bodies.motions import body_of_motion as shaped
-
     body, notes = shaped(body, path)
     for sentence in notes:
         job.note(f"{path}: {sentence}")
@@ -195,8 +198,6 @@ def with_rules(poses: PoseSet, path: Path, options: RuleOptions) -> PoseSet:
     ------
     LCollisionError : an option names an unknown group.
     """
-    from lcollision_core.bodies import open_body
-
     document = open_rigged(path)
     if document is not None:
         body = open_body(document)
@@ -231,8 +232,6 @@ def read_input_poses(
     given : with unique names
     failed : whether any file could not be read
     """
-    from lcollision_core.bodies import unique_names
-
     given: list[InputPose] = []
     failed = False
     for done, path in enumerate(paths):
@@ -250,8 +249,6 @@ def read_input_poses(
 
 
 def _given_in(body: Body, path: Path, scale: float, job: Job) -> Iterator[InputPose]:
-    from lcollision_core.bodies import encode_mesh, read_model_mesh
-
     if path.suffix.lower() == ".json":
         for pose in read_some_poses(path, body):
             yield InputPose(f"{path}: {pose.name}", pose)
@@ -278,8 +275,6 @@ def encode_meshes(
     LCollisionError : a mesh cannot be read or encoded, or the output cannot be written.
     CancelledError : the job was cancelled; finished poses are kept beside the output.
     """
-    from lcollision_core.bodies import encode_mesh, name_of_file, read_model_mesh, unique_names
-
     meshes = [read_model_mesh(path, body) for path in files]
     names = unique_names(name_of_file(mesh.source) for mesh in meshes)
     inputs = {"vertices": np.stack([mesh.vertices for mesh in meshes])}
@@ -305,8 +300,6 @@ def read_some_poses(path: Path, body: Body) -> Sequence[NamedPose]:
     ------
     ModelFileError : it has none, or belongs to another body.
     """
-    from lcollision_core.bodies import read_poses
-
     poses = read_poses(path, body)
     if not poses:
         raise ModelFileError("contains no poses", "name a file with poses", where=path)

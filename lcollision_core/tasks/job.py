@@ -8,19 +8,19 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy.typing as npt
 
+from lcollision_core.bodies import Body, NamedPose, read_poses, write_poses
+from lcollision_core.embedding.training_run import run_key
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.files import locked
-from lcollision_core.files.safe import atomic_write
+from lcollision_core.files.safe import atomic_write, shortened
 from lcollision_core.jobs import Job
+from lcollision_core.meshes.face_groups import ignored_faces_digest
+from lcollision_core.options import ResolveOptions
 from lcollision_core.tasks.words import counted, say
-
-if TYPE_CHECKING:
-    from lcollision_core.bodies import Body, NamedPose
-    from lcollision_core.options import ResolveOptions
 
 Arrays = dict[str, npt.NDArray[Any]]
 T = TypeVar("T")
@@ -159,9 +159,6 @@ def run_of_poses(
     LCollisionError : another command writes to this output, or an earlier run left poses of other
         inputs there.
     """
-    from lcollision_core.bodies import read_poses, write_poses
-    from lcollision_core.files.safe import shortened
-
     stem = output.stem if output.suffix.lower() == ".json" else output.name
     path = output.with_name(f"{shortened(stem, _MAX_STEM_BYTES)}.partial.json")
 
@@ -239,16 +236,12 @@ def key_of(body: Body, arrays: Mapping[str, npt.NDArray[Any]], values: Any) -> s
     """Return the key of a run: of its body, its inputs, and the program's version."""
     from importlib.metadata import version
 
-    from lcollision_core.embedding.training_run import run_key
-
     of_all = {"model": body.fingerprint, "version": version("lcollision")}
     return run_key(arrays, {**values, **of_all})
 
 
 def depends_on(body: Body, options: ResolveOptions) -> tuple[Arrays, dict[str, Any]]:
     """Return inputs determined by a body and options: arrays, and JSON values."""
-    from lcollision_core.meshes.face_groups import ignored_faces_digest
-
     arrays: Arrays = {"free": body.free_latent}
     for number, pair in enumerate(body.detector.may_touch):
         arrays |= {f"may touch {number} {side}": faces for side, faces in enumerate(pair)}

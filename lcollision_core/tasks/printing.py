@@ -5,24 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.bodies import Body, NamedPose
+from lcollision_core.contact import solids
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.safe import atomic_write
 from lcollision_core.files.table import FILES, PRINT_SUFFIXES, function_of
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.options import PrintOptions
+from lcollision_core.meshes import named_group
+from lcollision_core.options import PrintOptions, ResolveOptions
+from lcollision_core.posing import PoseSpace
 from lcollision_core.tasks.exporting import require_output
 from lcollision_core.tasks.verdicts import PrintedFigure
 from lcollision_core.tasks.words import printed_text
-
-if TYPE_CHECKING:
-    from lcollision_core.bodies import Body, NamedPose
-    from lcollision_core.options import ResolveOptions
-    from lcollision_core.posing import PoseSpace
 
 _STEPS = 100
 """Progress steps in all; the first half is Resolve's."""
@@ -54,8 +53,6 @@ def print_pose(
         written.
     CancelledError : the job was cancelled.
     """
-    from lcollision_core.contact import solids
-
     require_output(path, *PRINT_SUFFIXES)
     check = body.exact_check(pose.placement, own and own())
     before = check.find(check.exported(check.decode(pose.latent)[0]))
@@ -133,8 +130,6 @@ def export_print(
 
 
 def _left_out(body: Body, names: tuple[str, ...]) -> npt.NDArray[np.bool_]:
-    from lcollision_core.meshes import named_group
-
     groups = {group.name: group for kind in body.groups_by_kind.values() for group in kind}
     left_out = np.zeros(len(body.faces), dtype=np.bool_)
     for name in names:

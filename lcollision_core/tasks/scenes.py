@@ -5,14 +5,42 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.bodies import (
+    Body,
+    NamedPose,
+    as_scene,
+    name_of_file,
+    open_body,
+    read_model_mesh,
+    write_sequence,
+)
+from lcollision_core.bodies.motions import (
+    MotionChange,
+    is_retargeted,
+    read_motions,
+    write_clips,
+    write_new_clips,
+)
+from lcollision_core.bodies.names import unique_names
+from lcollision_core.bodies.poses import OtherModelError, read_poses
+from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember, ScenePart
+from lcollision_core.bodies.scene_file import (
+    beside,
+    body_of_scene,
+    is_scene_file,
+    read_scene_file,
+    write_scene_file,
+)
 from lcollision_core.errors import LCollisionError, PoseSetError
 from lcollision_core.files.table import POSES_SUFFIX, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.model_file import digest_of
+from lcollision_core.motion.motion import Motion, runs
 from lcollision_core.options import ExportRequest, MotionChoice, SceneOptions
 from lcollision_core.tasks.exporting import (
     refuse_to_replace,
@@ -21,15 +49,10 @@ from lcollision_core.tasks.exporting import (
     write_motions,
     written_members,
 )
+from lcollision_core.tasks.inputs import InputPose, read_some_poses
+from lcollision_core.tasks.resolving import ResolveMotionsRequest, resolve_one, run_of_motions
+from lcollision_core.tasks.verdicts import ResolvedClip
 from lcollision_core.tasks.words import say
-
-if TYPE_CHECKING:
-    from lcollision_core.bodies import Body, NamedPose
-    from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember
-    from lcollision_core.motion import Motion
-    from lcollision_core.tasks.inputs import InputPose
-    from lcollision_core.tasks.resolving import ResolveMotionsRequest
-    from lcollision_core.tasks.verdicts import ResolvedClip
 
 _ONLY_CLIP_RATE = 30.0
 
@@ -41,9 +64,6 @@ def open_scene(source: str, options: SceneOptions) -> Body:
     ------
     LCollisionError : a file cannot be read, or an option names an unknown body.
     """
-    from lcollision_core.bodies import open_body
-    from lcollision_core.bodies.scene_file import body_of_scene
-
     if not is_scene_file(source) and not options.has_others:
         given = ("--at", options.places), ("--fixed", options.fixed), ("--play", options.played)
         for name, values in given:
@@ -53,15 +73,6 @@ def open_scene(source: str, options: SceneOptions) -> Body:
     return body_of_scene(scene_of(source, options))
 
 
-def is_scene_file(source: str | Path) -> bool:
-    """Whether a file is a scene file: see `bodies.scene_file`."""
-    if Path(source).suffix.lower() != POSES_SUFFIX:
-        return False
-    from lcollision_core.bodies import scene_file
-
-    return scene_file.is_scene_file(source)
-
-
 def scene_of(source: str, options: SceneOptions) -> SceneFile:
     """Return the scene of a body, or of a scene file, with the options applied.
 
@@ -69,10 +80,6 @@ def scene_of(source: str, options: SceneOptions) -> SceneFile:
     ------
     LCollisionError : an option is malformed, or names an unknown body.
     """
-    from lcollision_core.bodies.names import unique_names
-    from lcollision_core.bodies.scene_body import SceneFile, ScenePart
-    from lcollision_core.bodies.scene_file import read_scene_file
-
     scene = read_scene_file(source) if is_scene_file(source) else SceneFile((ScenePart(source),))
     parts = list(scene.bodies)
     for entry in options.others:
@@ -128,9 +135,6 @@ def scene_of_files(files: Sequence[Path]) -> SceneFile:
     ------
     LCollisionError : a file is missing or cannot be read.
     """
-    from lcollision_core.bodies.scene_body import SceneFile, ScenePart
-    from lcollision_core.bodies.scene_file import beside
-
     first, *others = files
     scene = SceneFile((ScenePart(str(first.absolute())),))
     for file in others:
@@ -140,9 +144,6 @@ def scene_of_files(files: Sequence[Path]) -> SceneFile:
 
 def _scene_around(body: Body, body_file: str) -> SceneFile:
     """Return the scene that a body is, or one of that body alone."""
-    from lcollision_core.bodies import as_scene
-    from lcollision_core.bodies.scene_body import SceneFile, ScenePart
-
     scene = as_scene(body)
     scene_file = None if scene is None else scene.file
     return scene_file or SceneFile((ScenePart(str(Path(body_file).absolute())),))
@@ -155,8 +156,6 @@ def with_body(body: Body, body_file: str, path: Path) -> SceneFile:
     ------
     LCollisionError : the file cannot be read.
     """
-    from lcollision_core.bodies.scene_file import beside
-
     return beside(_scene_around(body, body_file), path.absolute())
 
 
@@ -183,9 +182,6 @@ def kept_scene(scene: SceneFile) -> Path:
     MeshFileError : it cannot be written.
     """
     from platformdirs import user_data_path
-
-    from lcollision_core.bodies.scene_file import write_scene_file
-    from lcollision_core.model_file import digest_of
 
     folder = user_data_path("lcollision", appauthor=False) / "scenes"
     folder.mkdir(parents=True, exist_ok=True)
@@ -218,10 +214,6 @@ def read_scene_poses(
     ------
     LCollisionError : a file cannot be read, or fits no body of the scene.
     """
-    from lcollision_core.bodies import NamedPose
-    from lcollision_core.bodies.poses import OtherModelError, read_poses
-    from lcollision_core.tasks.inputs import InputPose, read_some_poses
-
     poses_of: dict[str, list[NamedPose]] = {}
     sources: list[str] = []
     for path in files:
@@ -272,8 +264,6 @@ def read_scene_poses(
 
 def _encoded(member: SceneMember, path: Path, scale: float, job: Job) -> NamedPose:
     """Return the pose of a mesh; its position becomes codes of the whole body."""
-    from lcollision_core.bodies import NamedPose, name_of_file, read_model_mesh
-
     mesh = read_model_mesh(path, member.body)
     size = member.body.body_size
     latent = member.body.nearest(np.asarray(mesh.vertices) * scale / size, job)
@@ -322,9 +312,6 @@ def scene_motion(
     ------
     LCollisionError : an entry names an unknown body, a clip cannot be read, or nothing moves.
     """
-    from lcollision_core.bodies.motions import read_motions
-    from lcollision_core.motion import Motion
-
     asked_clips = _asked_clips(body, played, choice.clip)
     if not asked_clips:
         raise LCollisionError(
@@ -449,15 +436,6 @@ def write_member_motions(
     ------
     LCollisionError : a file cannot be written.
     """
-    from lcollision_core.bodies import write_sequence
-    from lcollision_core.bodies.motions import (
-        MotionChange,
-        is_retargeted,
-        write_clips,
-        write_new_clips,
-    )
-    from lcollision_core.motion.motion import Motion, runs
-
     folder.mkdir(parents=True, exist_ok=True)
     check, n = body.exact_check(), len(after)
     by_name = {member_motion.member.name: member_motion for member_motion in played}
@@ -554,8 +532,6 @@ def resolve_scene_motion(
         `in_place` is not set.
     CancelledError : the job was cancelled; finished frames are kept beside the output.
     """
-    from lcollision_core.tasks.resolving import resolve_one, run_of_motions
-
     motion, of_bodies = scene_motion(body, played, request.choice, job)
     output = request.output
     if output.form == "mesh":
