@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,7 +30,6 @@ from lcollision_core.files import (
     read_character,
     read_mesh,
     write_character,
-    write_character_clip,
     write_mesh,
     written_frame,
 )
@@ -434,23 +433,17 @@ class SourceFile:
         ------
         MeshFileError : the file cannot be written, or the joints cannot hold a pose.
         """
-        if self._character is None or self._body.joints is None:
-            raise MeshFileError.unwritable(
-                path, "the poses do not come from its joints", "choose .pc2"
-            )
-        space, made = self._body.joints, self._written
-        transforms = [_placed(space.transforms(latent), self.frame) for latent in latents]
-        frames = write_character_clip(
+        clip = self._new_clip(path, "poses", request.fps, np.stack(latents), vertices)
+        made, stored = self._written, list[npt.NDArray[Any]]()
+        _, notes = write_character_clips(
             path,
             made.character,
-            vertices[:, made.from_read],
-            np.stack(transforms)[:, made.joints],
-            request.fps,
+            [clip],
+            lambda _, frame: stored.append(frame[made.to_read]),
             self._body.rules,
-            shapes=shapes_in_file(space, made, np.stack(latents)),
             keep_clips=request.keep_clips,
         )
-        return [(frame.vertices[made.to_read], (*made.notes, *frame.notes)) for frame in frames]
+        return [(frame, (*made.notes, *notes)) for frame in stored]
 
     def write_motions(
         self, path: str | os.PathLike[str], motions: Sequence[Motion]
@@ -466,31 +459,44 @@ class SourceFile:
         ------
         MeshFileError : as in `write_clip`.
         """
-        character, space, frame = self._character, self._body.joints, self.frame
-        if character is None or space is None or frame is None:
-            raise MeshFileError.unwritable(
-                path, "the poses do not come from its joints", "choose .pc2"
-            )
-        made, check = self._written, self._body.exact_check()
-        free: list[list[bool]] = [[] for _ in motions]
-
-        def wanted(motion: Motion) -> Iterator[npt.NDArray[Any]]:
-            for number in range(len(motion)):
-                yield frame.apply(motion.vertices(number, check))[made.from_read]
+        check = self._body.exact_check()
+        frame = self.frame or RigidTransform(np.eye(3), np.zeros(3))
 
         def clip(motion: Motion) -> NewClip:
-            placed = [_placed(space.transforms(row), frame)[made.joints] for row in motion.codes]
-            shapes = shapes_in_file(space, made, motion.codes)
-            return NewClip(motion.name, motion.rate, np.stack(placed), wanted(motion), shapes)
+            wanted = (frame.apply(motion.vertices(n, check)) for n in range(len(motion)))
+            return self._new_clip(path, motion.name, motion.rate, motion.codes, wanted)
+
+        clips, made = list(map(clip, motions)), self._written
+        free: list[list[bool]] = [[] for _ in motions]
 
         def seen(number: int, stored: npt.NDArray[Any]) -> None:
             pose = WrittenPose(self.path, stored[made.to_read], 1.0 / frame.scale)
             free[number].append(not pose.collides(self._body))
 
         _, notes = write_character_clips(
-            path, made.character, list(map(clip, motions)), seen, self._body.rules, keep_clips=True
+            path, made.character, clips, seen, self._body.rules, keep_clips=True
         )
         return [np.array(row, dtype=np.bool_) for row in free], (*made.notes, *notes)
+
+    def _new_clip(
+        self,
+        path: str | os.PathLike[str],
+        name: str,
+        fps: float,
+        codes: FloatArray,
+        vertices: Iterable[npt.NDArray[Any]],
+    ) -> NewClip:
+        """Return (N, D) poses as a clip, with their vertices in the axes and unit of the file."""
+        space = self._body.joints
+        if self._character is None or space is None:
+            raise MeshFileError.unwritable(
+                path, "the poses do not come from its joints", "choose .pc2"
+            )
+        made = self._written
+        transforms = [_placed(space.transforms(row), self.frame)[made.joints] for row in codes]
+        shapes = shapes_in_file(space, made, codes)
+        wanted = (pose[made.from_read] for pose in vertices)
+        return NewClip(name, fps, np.stack(transforms), wanted, shapes)
 
     @cached_property
     def _written(self) -> GltfCharacter:

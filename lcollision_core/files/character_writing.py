@@ -206,10 +206,6 @@ _SAME_NUMBER = 1e-6
 
 _OTHER_FORM = "write a point cache (.pc2), or each pose in a file of its own"
 
-_CLIP = "poses"
-"""Name of the clip made of several poses."""
-
-
 _WRITTEN_SUFFIXES = (".glb", ".vrm")
 
 
@@ -344,51 +340,6 @@ class NewClip:
     shapes: FloatArray | None = None
 
 
-def write_character_clip(
-    path: str | os.PathLike[str],
-    character: Character,
-    vertices: npt.NDArray[Any],
-    transforms: FloatArray,
-    fps: float = 30.0,
-    rules: ContactRules = STRICT,
-    *,
-    shapes: FloatArray | None = None,
-    keep_clips: bool = False,
-) -> tuple[PosedFile, ...]:
-    """Write the character's own file with poses as a clip of its joints, the first in the file.
-
-    Parameters
-    ----------
-    path : see `write_character`
-    character : see `write_character`; it must have a rig
-    vertices : (N, V, 3) finite array, in its frame and unit
-    transforms : (N, J, 4, 4) global transforms of the joints
-    fps : frames per second
-    rules : see `write_character`
-    shapes : (N, S) sliders of its morph targets; at rest if None
-    keep_clips : whether its other clips stay, after this one
-
-    Returns
-    -------
-    for each frame, the same file and the vertices that readers see
-
-    Raises
-    ------
-    ShapeError, MeshFileError : see `write_character`; or the joints cannot reproduce a frame.
-    """
-    shape = (len(transforms), *character.rest_vertices.shape)
-    if not shape[0] or vertices.shape != shape or character.rig is None:
-        raise ShapeError.must_be(
-            f"frames of {character.name}", f"of a rig, of shape {shape}", vertices.shape
-        )
-    frames: list[FloatArray] = []
-    clip = NewClip(_CLIP, fps, transforms, vertices, shapes)
-    data, notes = write_character_clips(
-        path, character, [clip], lambda _, frame: frames.append(frame), rules, keep_clips=keep_clips
-    )
-    return tuple(PosedFile(data, stored, notes) for stored in frames)
-
-
 def write_character_clips(
     path: str | os.PathLike[str],
     character: Character,
@@ -402,10 +353,12 @@ def write_character_clips(
 
     Parameters
     ----------
-    path, character, rules, keep_clips : see `write_character_clip`
+    path, rules : see `write_character`
+    character : see `write_character`; it must have a rig
     clips : at least one clip
     seen : called in order for each frame of each clip with the clip's number and the (V, 3)
         vertices that readers of the file see
+    keep_clips : whether its other clips stay, after these
 
     Returns
     -------
@@ -414,7 +367,7 @@ def write_character_clips(
 
     Raises
     ------
-    ShapeError, MeshFileError : see `write_character_clip`.
+    MeshFileError : see `write_character`; or the joints cannot reproduce a frame.
     """
     require_written(path, character)
     file = _file_of(character)

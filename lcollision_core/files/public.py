@@ -15,7 +15,6 @@ from lcollision_core.files.character_writing import (
     PosedFile,
     read_own_file,
     write_character,
-    write_character_clip,
 )
 from lcollision_core.files.mesh_file import (
     Mesh,

@@ -20,9 +20,10 @@ from lcollision_core.files import (
     read_character,
     read_own_file,
     write_character,
-    write_character_clip,
 )
+from lcollision_core.files.character_writing import NewClip, write_character_clips
 from lcollision_core.files.scene_files import open_scene
+from lcollision_core.meshes.topology import FloatArray
 from tests.core.character_file import PNG, described, figure, vectors
 from tests.core.gltf_builder import GltfBuilder, rotation, split_corners, tube
 
@@ -112,7 +113,8 @@ def test_poses_as_a_clip_come_before_those_that_are_kept(
 ) -> None:
     vertices, transforms = _pose(character)
     path = tmp_path / "clips.glb"
-    write_character_clip(path, character, vertices[None], transforms[None], keep_clips=True)
+    clip = NewClip("poses", 30.0, transforms[None], [vertices])
+    write_character_clips(path, character, [clip], lambda *_: None, keep_clips=True)
     again = read_character(path)
     assert list(again.clips) == ["poses", *character.clips]
     size = float(np.ptp(character.rest_vertices, axis=0).max())
@@ -554,13 +556,15 @@ def test_a_clip_of_a_rig_that_is_scaled_unevenly_is_held_by_its_joints(tmp_path:
     codes = np.random.default_rng(3).uniform(-0.5, 0.5, (3, len(space.low)))
     vertices = space.decode(codes) * space.body_size
     transforms = np.stack([space.transforms(one) for one in codes])
-    frames = write_character_clip(path, character, vertices, transforms, fps=10.0)
+    clip = NewClip("poses", 10.0, transforms, vertices)
+    frames: list[FloatArray] = []
+    write_character_clips(path, character, [clip], lambda _, frame: frames.append(frame))
     reread = read_character(path)
     assert reread.rate("poses") == 10.0
     again = reread.sample("poses", None).vertices
     for wanted, frame, held in zip(vertices, frames, again, strict=True):
-        assert np.abs(frame.vertices - wanted).max() < 1e-5 * space.body_size
-        assert np.abs(held - frame.vertices).max() < 1e-6 * space.body_size
+        assert np.abs(frame - wanted).max() < 1e-5 * space.body_size
+        assert np.abs(held - frame).max() < 1e-6 * space.body_size
 
 
 def test_what_joints_cannot_hold_is_written_as_a_mesh_and_said(tmp_path: Path) -> None:
@@ -587,5 +591,6 @@ def test_what_joints_cannot_hold_is_written_as_a_mesh_and_said(tmp_path: Path) -
     # A clip has no other form.
     transforms = np.stack([_pose(character)[1]] * 2)
     sentence = r"figure\.glb cannot be written with these poses: its joints .*; write a point cache"
+    clip = NewClip("poses", 30.0, transforms, [vertices] * 2)
     with pytest.raises(MeshFileError, match=sentence):
-        write_character_clip(path, character, np.stack([vertices] * 2), transforms)
+        write_character_clips(path, character, [clip], lambda *_: None)
