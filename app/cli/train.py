@@ -157,8 +157,8 @@ def predictor(
     from lcollision_core.bodies import LearnedBody, checkpoint_path, model_destination, save_trained
     from lcollision_core.bodies.scoring import CARD_POSES
     from lcollision_core.files import file_stamp, require_writable
-    from lcollision_core.predictor import PRESETS, has_begun, patches_path
-    from lcollision_core.tasks.learning import learn_predictor
+    from lcollision_core.predictor import PRESETS, has_begun, patches_path, train_predictor
+    from lcollision_core.tasks.learning import LearnedPredictor
 
     destination = model_destination(output)
     require_writable(destination)
@@ -176,16 +176,18 @@ def predictor(
         if leads
         else nullcontext(job) as job,
     ):
-        learned = learn_predictor(
-            model,
+        trained = train_predictor(
             store.load(n_rows),
+            model.embedding,
             replace(config, by_domain=not no_domains),
             store=store.identity,
+            groups=model.groups,
             checkpoint=checkpoint,
             seed=seed,
             device=device,
             job=job,
         )
+    learned = LearnedPredictor(model, trained)
     if leads:
         if not len(learned.free_poses):
             note(
@@ -194,7 +196,8 @@ def predictor(
             )
         with progress_bar("Judging kinds of poses") as job:
             learned = learned.with_scores(CARD_POSES, 0, job)
-        written, trained = save_trained(destination, before, model, learned.of), learned.predictor
+        written = save_trained(destination, before, model, learned.of)
+        trained = learned.predictor
         note_if_beside(written, destination)
         checkpoint.unlink(missing_ok=True)
         if trained.metrics is not None:

@@ -10,33 +10,36 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.bodies import LearnedBody, save_trained
 from lcollision_core.bodies.scoring import CARD_POSES, places_of, propose_rules, score_kinds
-from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox
+from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox, train_embedding
 from lcollision_core.embedding.bilevel import BOX_SCALE
-from lcollision_core.embedding.training_run import EmbeddingConfig
+from lcollision_core.embedding.training_run import EmbeddingConfig, TrainingStatus
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
 from lcollision_core.files import PoseSet, read_pose_set, write_pose_set
 from lcollision_core.files.table import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.json_values import from_json, to_json
+from lcollision_core.labels import LabelStatus, LabelStore, label_poses
 from lcollision_core.labels.labeller import BOX_ROWS, MIXED_COST
 from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
-from lcollision_core.options import LearningRequest, Quality
-from lcollision_core.predictor import PRESETS, KindScores, PredictorConfig
+from lcollision_core.options import LearningRequest, Quality, SampleDistribution
+from lcollision_core.predictor import (
+    PRESETS,
+    CollisionPredictor,
+    KindScores,
+    PredictorConfig,
+    PredictorStatus,
+    train_predictor,
+)
+from lcollision_core.resolve import find_free_poses
 from lcollision_core.tasks.sources import gather_poses, with_proposed_rules
 from lcollision_core.tasks.work_folder import WorkFolder
-
-if TYPE_CHECKING:
-    from lcollision_core.embedding.training_run import TrainingStatus
-    from lcollision_core.labels import LabelRows, LabelStatus
-    from lcollision_core.labels.labeller import StoreIdentity
-    from lcollision_core.predictor import CollisionPredictor, PredictorStatus
 
 
 @dataclass(frozen=True)
@@ -496,8 +499,6 @@ def learn_latent_space(
     ------
     CancelledError : the job was cancelled; the checkpoint holds the last epoch.
     """
-    from lcollision_core.embedding.training import train_embedding
-
     trained = train_embedding(poses, config, checkpoint=checkpoint, seed=seed, job=job)
     digest = hashlib.sha256(np.ascontiguousarray(poses.vertices).tobytes()).hexdigest()
     provenance = {
@@ -507,44 +508,6 @@ def learn_latent_space(
         **facts,
     }
     return LearnedBody.from_training(name, trained, poses, source, licence, provenance)
-
-
-def learn_predictor(
-    body: LearnedBody,
-    rows: LabelRows,
-    config: PredictorConfig,
-    *,
-    store: StoreIdentity,
-    checkpoint: Path,
-    seed: int,
-    device: str = "auto",
-    job: Job = UNWATCHED,
-) -> LearnedPredictor:
-    """Learn a body's predictor from labelled rows.
-
-    Parameters
-    ----------
-    body : its predictor, if any, is not used
-    rows, config, store, checkpoint, seed, device, job : see `train_predictor`
-
-    Raises
-    ------
-    CancelledError : the job was cancelled; the checkpoint holds the last step.
-    """
-    from lcollision_core.predictor import train_predictor
-
-    trained = train_predictor(
-        rows,
-        body.embedding,
-        config,
-        store=store,
-        groups=body.groups,
-        device=device,
-        checkpoint=checkpoint,
-        job=job,
-        seed=seed,
-    )
-    return LearnedPredictor(body, trained)
 
 
 @dataclass(frozen=True, eq=False)
@@ -563,8 +526,6 @@ class LearnedPredictor:
     @cached_property
     def free_poses(self) -> npt.NDArray[np.floating]:
         """(F, D) collision-free poses of the body, which Resolve can fall back to."""
-        from lcollision_core.resolve import find_free_poses
-
         return find_free_poses(self.body.embedding, self.body.exact_check())
 
     def of(self, body: LearnedBody) -> LearnedBody:
@@ -713,9 +674,6 @@ class _Learner:
         return model
 
     def _predictor(self, model: LearnedBody) -> Path:
-        from lcollision_core.labels import LabelStore, label_poses
-        from lcollision_core.options import SampleDistribution
-
         work, effort, seed = self._work, self._effort, self._request.seed
         self._enter(Stage.LABELS)
 
@@ -741,15 +699,17 @@ class _Learner:
                 done = _PATCHES + (_PASSES - _PATCHES) * status.done / status.total
             self._at(done, [])
 
-        learned = learn_predictor(
-            model,
+        trained = train_predictor(
             store.load(effort.n_samples),
+            model.embedding,
             effort.predictor,
             store=store.identity,
+            groups=model.groups,
             checkpoint=work.checkpoint(Stage.PREDICTOR),
             seed=seed,
             job=self._job.part(told_epochs),
         )
+        learned = LearnedPredictor(model, trained)
         finished = learned.with_scores(effort.n_judged, seed, self._part(_PASSES)).of(model)
         provenance = {**finished.card.provenance, "seconds": self._seconds()}
         finished = finished.with_card(replace(finished.card, provenance=provenance))

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,23 @@ from lcollision_core.files.scene.transforms import (
 )
 from lcollision_core.json_values import quoted
 from lcollision_core.meshes.topology import FloatArray
+
+
+class Nodes(NamedTuple):
+    """The n nodes of a file, without their meshes.
+
+    Attributes
+    ----------
+    parents : (n,) int64 array, -1 for a root
+    order : the nodes, parents first
+    local, rest : (n, 4, 4) local and global transforms
+    """
+
+    parents: npt.NDArray[np.int64]
+    order: list[int]
+    local: FloatArray
+    rest: FloatArray
+
 
 _WEIGHTS = "weights"
 
@@ -237,9 +254,8 @@ class _GltfClip:
     where : name of the animation in error messages
     driven : the sampler, and its numbers per key, by node and property
     stored : returns the translation, rotation and scale of a node in the file
-    local : (n, 4, 4) array, local transforms of the nodes in the file
-    parents, order : parents of the nodes, and their order with parents first
-    part_nodes : the node that shows each part
+    nodes : of the file
+    parts : parts that the nodes show
     default_weights : weights of each part's morph targets in the file
     """
 
@@ -247,10 +263,8 @@ class _GltfClip:
     where: str
     driven: dict[tuple[int, str], tuple[dict[str, Any], int]]
     stored: Callable[[int], dict[str, FloatArray]]
-    local: FloatArray
-    parents: npt.NDArray[np.int64]
-    order: Sequence[int]
-    part_nodes: tuple[int, ...]
+    nodes: Nodes
+    parts: Sequence[Part]
     default_weights: tuple[FloatArray, ...]
 
     @property
@@ -337,32 +351,31 @@ class _GltfClip:
                 weights |= {node: values[:, i] for i, node in enumerate(track.nodes)}
             else:
                 stored[track.path][:, [row[node] for node in track.nodes]] = values
-        local = np.tile(self.local, (n, 1, 1, 1))
+        local = np.tile(self.nodes.local, (n, 1, 1, 1))
         local[:, nodes] = compose(stored["translation"], stored["rotation"], stored["scale"])
-        transforms = global_transforms(local, self.parents, self.order)
+        transforms = global_transforms(local, self.nodes.parents, self.nodes.order)
         # Primitives of a mesh may have fewer targets than the first.
         of_parts = tuple(
-            weights[node][:, : len(default)] if node in weights else np.tile(default, (n, 1))
-            for node, default in zip(self.part_nodes, self.default_weights, strict=True)
+            weights[part.node][:, : len(default)]
+            if part.node in weights
+            else np.tile(default, (n, 1))
+            for part, default in zip(self.parts, self.default_weights, strict=True)
         )
         return ScenePoses(transforms, of_parts)
 
 
 def read_clips(
     document: GltfDocument,
-    local: FloatArray,
-    parents: npt.NDArray[np.int64],
-    order: Sequence[int],
-    parts: Sequence[Part],
-    default_weights: tuple[FloatArray, ...],
+    nodes: Nodes,
+    parts: Sequence[Part] = (),
+    default_weights: tuple[FloatArray, ...] = (),
 ) -> tuple[Clip, ...]:
     """Return the animations that move a node or weight a morph target; arrays are read later.
 
     Parameters
     ----------
     document : the file
-    local : (n, 4, 4) array, local transforms of the nodes in the file
-    parents, order : parents of the nodes, and their order with parents first
+    nodes : of the file
     parts : parts that the nodes show
     default_weights : weights of each part's morph targets in the file
 
@@ -374,25 +387,14 @@ def read_clips(
     animations = document.objects("animations")
     names = _names(animations)
     n_targets = _target_counts(parts)
-    part_nodes = tuple(part.node for part in parts)
-    nodes = document.objects("nodes")
-    stored = cache(lambda number: _stored(nodes[number], number))
+    described = document.objects("nodes")
+    stored = cache(lambda number: _stored(described[number], number))
     clips = []
     for name, animation in zip(names, animations, strict=True):
         where = f"animation {name!r}"
         driven = _driven(document, animation, where, n_targets)
         if driven:
-            sample = _GltfClip(
-                document,
-                where,
-                driven,
-                stored,
-                local,
-                parents,
-                order,
-                part_nodes,
-                default_weights,
-            )
+            sample = _GltfClip(document, where, driven, stored, nodes, parts, default_weights)
             is_baked = inner(animation, "extras").get(KEYS_ARE_FRAMES) is True
             clips.append(Clip(name, sample.moved, sample.key_times, sample, is_baked))
     return tuple(clips)

@@ -5,13 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.files.gltf.clips import POINTER, pointed_node, pointer_of, read_clips
+from lcollision_core.files.gltf.clips import (
+    POINTER,
+    Nodes,
+    pointed_node,
+    pointer_of,
+    read_clips,
+)
 from lcollision_core.files.gltf.look import GltfLooks
 from lcollision_core.files.gltf.packed import unpack
 from lcollision_core.files.gltf.schema import (
@@ -240,22 +246,6 @@ _UP = np.array([0.0, 1.0, 0.0])
 """Defined by the standard."""
 
 
-class Nodes(NamedTuple):
-    """The n nodes of a file, without their meshes.
-
-    Attributes
-    ----------
-    parents : (n,) int64 array, -1 for a root
-    order : the nodes, parents first
-    local, rest : (n, 4, 4) local and global transforms
-    """
-
-    parents: npt.NDArray[np.int64]
-    order: list[int]
-    local: FloatArray
-    rest: FloatArray
-
-
 def read_nodes(document: GltfDocument) -> Scene:
     """Read the nodes of a glTF file and the clips that move them, with or without meshes.
 
@@ -271,7 +261,7 @@ def read_nodes(document: GltfDocument) -> Scene:
         nodes.parents,
         ScenePoses(nodes.rest[None], ()),
         (),
-        read_clips(document, nodes.local, nodes.parents, nodes.order, (), ()),
+        read_clips(document, nodes),
         up=_UP,
         metres=1.0,
         showing=frozenset(
@@ -308,26 +298,25 @@ def read_shown(document: GltfDocument) -> Scene:
     """
     require_readable(document)
     unpack(document)
-    parents, order, local, rest = _nodes(document)
-    primitives, notes = _shown_primitives(document, parents)
+    nodes = _nodes(document)
+    primitives, notes = _shown_primitives(document, nodes.parents)
     if not primitives:
         if not document.objects("meshes") and document.objects("animations"):
             raise NoMeshError(*NO_MESH)
         what = "it shows no triangles"
         raise MeshFileError(f"{what} ({'; '.join(notes)})" if notes else what)
     looks = GltfLooks(document)
-    parts = tuple(_part(document, primitive, rest, looks) for primitive in primitives)
+    parts = tuple(_part(document, primitive, nodes.rest, looks) for primitive in primitives)
     defaults = tuple(
         _default_weights(document, shown_mesh, part)
         for shown_mesh, part in zip(primitives, parts, strict=True)
     )
-    clips = read_clips(document, local, parents, order, parts, defaults)
     return Scene(
         _node_names(document),
-        parents,
-        ScenePoses(rest[None], tuple(weights[None] for weights in defaults)),
+        nodes.parents,
+        ScenePoses(nodes.rest[None], tuple(weights[None] for weights in defaults)),
         parts,
-        clips,
+        read_clips(document, nodes, parts, defaults),
         up=_UP,
         metres=1.0,
         notes=notes,
