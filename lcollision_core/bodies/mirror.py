@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import PoseSetError, ShapeError, WrongScaleError
-from lcollision_core.files import can_hold
+from lcollision_core.files.mesh_file import can_hold, first_not_finite
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform, Topology, body_size
 from lcollision_core.meshes.joint_kinds import Role, Side
@@ -103,8 +103,7 @@ def checked_mesh(
     mesh = np.asarray(vertices, dtype=np.float64)
     if mesh.shape != reference.shape:
         raise ShapeError.must_be(f"a mesh of {model}", f"of shape {reference.shape}", mesh.shape)
-    if not np.isfinite(mesh).all():
-        vertex = int(np.flatnonzero(~np.isfinite(mesh).all(axis=1))[0])
+    if (vertex := first_not_finite(mesh)) is not None:
         raise ShapeError("is not finite", where=f"vertex {vertex} (from 0)")
     if not can_hold(mesh, topology, np.float64):
         raise PoseSetError(

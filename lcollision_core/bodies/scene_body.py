@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, zip_longest
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +44,8 @@ _GAP = 0.01
 """Normalised gap between bodies in poses that are assumed to be free."""
 
 _GREY = "#808080"
+
+_T = TypeVar("_T")
 
 
 _MOST_BODIES = 64
@@ -246,7 +248,7 @@ class SceneBody(Body):
         )
         start = max((rows_of.stop for rows_of in self.vertices_of.values()), default=0)
         first_face = max((faces_of.stop for faces_of in self.faces_of.values()), default=0)
-        held_members = [other for other in self.members if other.holder == member.name]
+        held_members = self._held_by(member)
         faces, n_vertices = [], 0
         for moved_member in (member, *held_members):
             faces.append(moved_member.body.faces + n_vertices)
@@ -278,7 +280,7 @@ class SceneBody(Body):
             several = len(own) > 1
             names += [self._in_body(member.name, part) if several else member.name for part in own]
             colours += member.body.card.domain_colours if member.moves else (_GREY,)
-            held_names = [other.name for other in self.members if other.holder == member.name]
+            held_names = [other.name for other in self._held_by(member)]
             names += held_names
             colours += [_GREY] * len(held_names)
         return tuple(unique_names(names, MAX_NAME_LENGTH)), tuple(colours)
@@ -355,12 +357,17 @@ class SceneBody(Body):
             (*others, *joints),
         )
 
-    def _part_of(self, member: SceneMember) -> int:
-        """Return the body part that holds a member, as an index into the scene's."""
-        at = next(n for n, entry in enumerate(self.standing) if entry.name == member.holder)
-        joints = self.standing[at].body.joints
+    def _held_by(self, holder: SceneMember) -> list[SceneMember]:
+        """Return the props that a member holds."""
+        return [member for member in self.members if member.holder == holder.name]
+
+    def _part_of(self, prop: SceneMember) -> int:
+        """Return the body part that holds a prop, as an index into the scene's."""
+        assert prop.holder is not None
+        joints = self.member(prop.holder).body.joints
         assert joints is not None
-        return self._space.domains[at].start + int(joints.part_of_joint[member.joint])
+        first = self.domains_of_member(prop.holder).start
+        return first + int(joints.part_of_joint[prop.joint])
 
     @property
     def space(self) -> SceneSpace:
@@ -516,22 +523,32 @@ class SceneBody(Body):
     def code_effects(self) -> tuple[CodeEffect, ...]:
         """The effects of the bodies' codes."""
         effects: dict[int, CodeEffect] = {}
-        for member, own, parts in zip(
-            self.standing, self._space.codes, self._space.domains, strict=True
-        ):
-            for place, effect in zip(own.tolist(), _of_codes(member, "code_effects"), strict=True):
-                domain = min(parts.start + effect.domain, parts.stop - 1)
-                effects[place] = replace(effect, domain=domain)
+        for place, member, effect in self._by_code(lambda body: body.code_effects):
+            parts = self.domains_of_member(member.name)
+            domain = min(parts.start + effect.domain, parts.stop - 1)
+            effects[place] = replace(effect, domain=domain)
         return tuple(effects[place] for place in range(self.latent_size))
+
+    def _by_code(
+        self, of_codes: Callable[[Body], Sequence[_T]]
+    ) -> Iterator[tuple[int, SceneMember, _T]]:
+        """Yield, for each code, its index, its body and what that body has for it."""
+        for member, own in zip(self.standing, self._space.codes, strict=True):
+            if member.moves:
+                for place, value in zip(own.tolist(), of_codes(member.body), strict=True):
+                    yield place, member, value
+
+    def _named_codes(self, of_codes: Callable[[Body], Sequence[str]]) -> list[str]:
+        """Return D names of codes; those of whole bodies are prefixed with the body's name."""
+        names, n_whole = [""] * self.latent_size, self._space.group_sizes[0]
+        for place, member, name in self._by_code(of_codes):
+            names[place] = self._in_body(member.name, name) if place < n_whole else name
+        return names
 
     @cached_property
     def code_names(self) -> tuple[str, ...]:
         """D names of the codes; those of whole bodies are prefixed with the body's name."""
-        names = [""] * self.latent_size
-        n_whole = self._space.group_sizes[0]
-        for member, own in zip(self.standing, self._space.codes, strict=True):
-            for place, name in zip(own.tolist(), _of_codes(member, "code_names"), strict=True):
-                names[place] = self._in_body(member.name, name) if place < n_whole else name
+        names = self._named_codes(lambda body: body.code_names)
         return (*names[: sum(self._space.group_sizes)], *self.shape_names)
 
     @property
@@ -548,9 +565,8 @@ class SceneBody(Body):
     def code_words(self) -> tuple[str, ...]:
         """D search texts, each with the name of the code's body."""
         words = [""] * self.latent_size
-        for member, own in zip(self.standing, self._space.codes, strict=True):
-            for place, text in zip(own.tolist(), _of_codes(member, "code_words"), strict=True):
-                words[place] = f"{member.name.lower()} {text}"
+        for place, member, text in self._by_code(lambda body: body.code_words):
+            words[place] = f"{member.name.lower()} {text}"
         return tuple(words)
 
     @cached_property
@@ -558,17 +574,18 @@ class SceneBody(Body):
         """The groups, names, colours and ranges of the codes."""
         at_rest, shown = np.zeros(self.latent_size), np.ones(self.latent_size)
         units = [""] * self.latent_size
-        code_names = [""] * self.latent_size
-        n_whole = self._space.group_sizes[0]
-        for member, own in zip(self.standing, self._space.codes, strict=True):
-            if not member.moves:
-                continue
-            of_member = member.body.latent_space
-            at_rest[own], shown[own] = of_member.at_rest, of_member.shown
-            labels = [name for group in of_member.groups for name in group.code_names]
-            for place, name, unit in zip(own.tolist(), labels, of_member.units, strict=True):
-                code_names[place] = self._in_body(member.name, name) if place < n_whole else name
-                units[place] = unit
+        for place, _, code in self._by_code(lambda body: body.latent_space.at_rest.tolist()):
+            at_rest[place] = code
+        for place, _, factor in self._by_code(lambda body: body.latent_space.shown.tolist()):
+            shown[place] = factor
+        for place, _, unit in self._by_code(lambda body: body.latent_space.units):
+            units[place] = unit
+
+        def labels(body: Body) -> list[str]:
+            groups = body.latent_space.groups
+            return [name for group in groups for name in group.code_names]
+
+        code_names = self._named_codes(labels)
         ends = np.cumsum(self._space.group_sizes).tolist()
         shapes = LatentGroup(SHAPES, None, self.shape_codes, self.shape_names)
         whole = LatentGroup(WHOLE_BODY, None, slice(0, ends[0]), tuple(code_names[: ends[0]]))
@@ -680,7 +697,7 @@ class SceneBody(Body):
             body, place = member.body, self._space.members[at].place
             if not body.can_resolve:
                 continue
-            holds = [other for other in self.members if other.holder == member.name]
+            holds = self._held_by(member)
             if holds and len(self.standing) > 1:
                 body = SceneBody([member, *holds])
                 place = RigidTransform(np.eye(3), np.zeros(3), body.body_size / self._size)
@@ -782,11 +799,6 @@ class SceneResolver(PoseResolver):
 def _bends(body: Body) -> bool:
     """Whether a posable body has parts that move relative to each other."""
     return len(body.space.low) > body.space.group_sizes[0]
-
-
-def _of_codes(member: SceneMember, what: str) -> Sequence[Any]:
-    """Return an attribute with one entry per code of a member; empty for a static one."""
-    return cast("Sequence[Any]", getattr(member.body, what)) if member.moves else ()
 
 
 def _plain(body: Body) -> Appearance:

@@ -49,7 +49,7 @@ from lcollision_core.contact.search import (
 )
 from lcollision_core.devices import uses_gpu
 from lcollision_core.errors import ShapeError
-from lcollision_core.files.mesh_file import can_hold
+from lcollision_core.files.mesh_file import can_hold, first_not_finite
 from lcollision_core.jobs import UNWATCHED, Job, available_cores, for_blocks
 from lcollision_core.meshes.contact_rules import N_RULES, STRICT, ContactRules, RuleCounts
 from lcollision_core.meshes.extents import body_size
@@ -205,8 +205,7 @@ class CollisionDetector:
             raise ShapeError.must_be(
                 "the reference", f"of shape ({topology.n_vertices}, 3)", vertices.shape
             )
-        if not np.isfinite(vertices).all():
-            vertex = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+        if (vertex := first_not_finite(vertices)) is not None:
             raise ShapeError("is not finite", where=f"vertex {vertex} of the reference")
         self.topology = topology
         self.rules, self.groups, self.reference = rules, tuple(groups), vertices

@@ -78,24 +78,7 @@ def exclusions_of(
     if rules.rest_exclusion is not None:
         distance = rules.rest_exclusion * body_size
         by_rest = _about(topology, reference, touching, distance, _REST)
-    none = no_lists(0)
-    listed = Exclusions(
-        corners=topology.faces,
-        near_start=near.start,
-        near=near.entry,
-        start=by_rest.start,
-        face=by_rest.entry,
-        region=np.empty(0, dtype=np.int32),
-        ignored=np.zeros((0, 0), dtype=np.bool_),
-        squared_tolerance=np.zeros((1, 1)),
-        joint_start=none.start,
-        joint=none.entry,
-        touching_start=none.start,
-        touching=none.entry,
-        shape_start=none.start,
-        shape=none.entry,
-    )
-    return with_other_rules(listed, rules, topology, reference, body_size, groups)
+    return _listed(near, by_rest, rules, topology, reference, body_size, groups)
 
 
 def _creases(
@@ -144,6 +127,24 @@ def with_other_rules(
 
     Parameters and errors are those of `exclusions_of`.
     """
+    near = Lists(exclusions.near_start, exclusions.near)
+    by_rest = Lists(exclusions.start, exclusions.face)
+    return _listed(near, by_rest, rules, topology, reference, body_size, groups)
+
+
+def _listed(
+    near: Lists,
+    by_rest: Lists,
+    rules: ContactRules,
+    topology: Topology,
+    reference: FloatArray,
+    body_size: float,
+    groups: Sequence[FaceGroup],
+) -> Exclusions:
+    """Return exclusions with the given lists of near vertices and of faces near contacts at rest.
+
+    Parameters and errors are those of `exclusions_of`.
+    """
     n_faces = topology.n_faces
     require_groups(rules, groups, n_faces)
     region, ignored, squared_tolerance = _regions(rules, without_joints(groups), n_faces)
@@ -156,17 +157,8 @@ def with_other_rules(
             (rules.shape_touching, TOUCHING_RADIUS),
         )
     )
-    return exclusions._replace(
-        region=region,
-        ignored=ignored,
-        squared_tolerance=squared_tolerance,
-        joint_start=by_joint.start,
-        joint=by_joint.entry,
-        touching_start=by_touch.start,
-        touching=by_touch.entry,
-        shape_start=by_shape.start,
-        shape=by_shape.entry,
-    )
+    regions = region, ignored, squared_tolerance
+    return Exclusions(topology.faces, *near, *by_rest, *regions, *by_joint, *by_touch, *by_shape)
 
 
 def _faces_of(patches: Sequence[tuple[int, int]], n_faces: int) -> Pairs:
