@@ -179,7 +179,7 @@ def moved_onto(body: RigBody, source: RigBody, motion: Motion) -> Motion:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "motion.bvh"
         path.write_bytes(bvh_of(source.space, transforms, 1.0 / motion.rate))
-        retargeting = Retargeting.of(read_bvh(path), body.space, path)
+        retargeting = Retargeting.of(read_bvh(path).motion, body.space, path)
     codes = body.space.unwound(body.space.codes_of_transforms(retargeting.transforms()))
     copied = Motion(motion.name, motion.times, codes)
     return replace(

@@ -865,7 +865,7 @@ def _write_bvh(
             np.array([space.transforms(motion.codes[frame]) for frame in frames])
             for motion in (change.before, change.after)
         )
-        carried = Retargeting.of(bvh, space, file).changed(frames, before, after)
+        carried = Retargeting.of(bvh.motion, space, file).changed(frames, before, after)
         data = bvh.with_frames(frames, *carried)
     with atomic_write(path) as out:
         out.write(data)

@@ -30,9 +30,10 @@ from lcollision_core.bodies.skeletons import (
     role_name,
     role_of_word,
 )
-from lcollision_core.bodies.standing_pose import SkeletonMotion, common_ancestor
+from lcollision_core.bodies.standing_pose import common_ancestor
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.files import Character
+from lcollision_core.files.motion.skeleton import SkeletonMotion
 from lcollision_core.files.safe import atomic_write, read_regular
 from lcollision_core.json_values import from_json, parse_json
 from lcollision_core.meshes.joint_kinds import Role, Side

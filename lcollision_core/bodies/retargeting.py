@@ -32,7 +32,6 @@ from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, axes_of, limb_children, rig_of
 from lcollision_core.bodies.standing_pose import (
     ReposedMotion,
-    SkeletonMotion,
     in_world,
     least_turn,
     rest_places,
@@ -45,8 +44,8 @@ from lcollision_core.files.character_reading import is_gltf
 from lcollision_core.files.gltf.read import human_bones
 from lcollision_core.files.motion.bvh import Bvh, bvh_bytes, depth_first, read_bvh
 from lcollision_core.files.motion.generated import is_generated, read_generated
-from lcollision_core.files.motion.node_motion import (
-    NodeMotion,
+from lcollision_core.files.motion.skeleton import (
+    SkeletonMotion,
     motions_of_scene,
     nearest_axes,
     relative_to_parents,
@@ -117,7 +116,7 @@ class Retargeting:
         )
         if len(stored.names) < LEAST_JOINTS:
             raise other
-        same = _as_the_rig(stored, space) if isinstance(stored, NodeMotion) else None
+        same = _as_the_rig(stored, space)
         motion = same or with_standing_rest(stored)
         rest, rig = rest_places(motion), space.rig
         figure, anatomy, partner, _ = _followed(motion, rest, space, path)
@@ -196,7 +195,7 @@ class Retargeting:
         """
         frame_numbers = list(frames)
         turns, _ = in_world(self.motion)
-        old_turns, local = turns[frame_numbers], self.motion.rotations()[frame_numbers]
+        old_turns, local = turns[frame_numbers], self.motion.turns[frame_numbers]
         rest = np.linalg.inv(self.space.rig.rest)
         difference = (after @ rest)[..., :3, :3] @ np.linalg.inv((before @ rest)[..., :3, :3])
         # If several joints follow one, the last carries its children.
@@ -210,7 +209,7 @@ class Retargeting:
                 local[:, joint] = np.swapaxes(above, -2, -1) @ new_turns[:, joint]
             else:
                 new_turns[:, joint] = above @ local[:, joint]
-        roots: FloatArray = self.motion.positions()[frame_numbers, 0]
+        roots: FloatArray = self.motion.places[frame_numbers, 0]
         if self._hips >= 0:
             roots += (after - before)[:, self._hips, :3, 3] @ self.frame / self.scale
         return self.motion.turns_as_stored(local), roots
@@ -283,14 +282,14 @@ _SAME_BONE, _ALIKE, _TWISTED = np.cos(np.radians([5.0, 30.0, 60.0]))
 twist of a hinge, which no pose makes."""
 
 
-def _as_the_rig(motion: NodeMotion, space: RigPoseSpace) -> ReposedMotion | None:
+def _as_the_rig(motion: SkeletonMotion, space: RigPoseSpace) -> ReposedMotion | None:
     """Return a motion of a rig's own joints with the rig's rest pose; None for other joints.
 
     Joints are the rig's own if they have its names and their bones have the same local directions,
     whatever pose the file stores, and whatever their lengths.
     """
     rig, partner = space.rig, match_by_name(motion, space)
-    if len(followed_limbs(partner, space)) < LEAST_JOINTS:
+    if motion.axes is None or len(followed_limbs(partner, space)) < LEAST_JOINTS:
         return None
     axes, places, cosines = rotations_of(rig.rest), rig.rest[:, :3, 3], list[float]()
     in_limb, size = limb_children(rig, space.roles), float(np.ptp(rig.rest[:, :3, 3], axis=0).max())
@@ -320,11 +319,11 @@ def _as_the_rig(motion: NodeMotion, space: RigPoseSpace) -> ReposedMotion | None
         elif parent >= 0:
             rested[joint] = rested[parent] @ motion.axes[parent].T @ motion.axes[joint]
     turns: FloatArray = rested @ np.swapaxes(motion.axes, 1, 2)
-    return ReposedMotion(motion, turns, space.up @ frame, space.front @ frame)
+    return ReposedMotion.of(motion, turns, space.up @ frame, space.front @ frame)
 
 
 def _axes_of_rig(
-    motion: NodeMotion,
+    motion: SkeletonMotion,
     space: RigPoseSpace,
     partner: npt.NDArray[np.int64],
     axes: FloatArray,
@@ -338,6 +337,7 @@ def _axes_of_rig(
     ----------
     axes : (J, 3, 3) rotations of the rig's joints at rest
     """
+    assert motion.axes is not None
     trunk = [
         joint
         for joint, role in enumerate(space.roles)
@@ -453,7 +453,7 @@ def bvh_of(space: RigPoseSpace, transforms: FloatArray, frame_time: float) -> by
 def transforms_from_bvh(space: RigPoseSpace, bvh: Bvh) -> FloatArray:
     """Return the (T, J, 4, 4) transforms of a rig's joints from a file of `bvh_of`."""
     rig, parents, axes = space.rig, _one_tree(space.rig), space.to_body
-    turns, places = in_world(bvh)
+    turns, places = in_world(bvh.motion)
     order, _ = depth_first(parents)
     rows = np.argsort(order)[len(parents) - len(rig.parents) :]
     transforms = np.tile(np.eye(4), (len(turns), len(rows), 1, 1))
@@ -662,13 +662,13 @@ def retargeted_motions(
     motions = []
     for motion in _read(path, clip, fps):
         times = motion.times
-        if fps is not None and (isinstance(motion, Bvh) or is_generated(path)):
+        if fps is not None and (path.suffix.lower() == BVH_SUFFIX or is_generated(path)):
             times = np.arange(len(times), dtype=np.float64) / fps
         carrying = Retargeting.of(motion, space, path)
         codes = space.unwound(space.codes_of_transforms(carrying.transforms()))
         # VRM animations are named after the program that wrote them.
         is_vrma = path.suffix.lower() == VRMA_SUFFIX
-        name = motion.name if isinstance(motion, NodeMotion) and not is_vrma else ""
+        name = "" if is_vrma else motion.name
         motions.append((Motion(name or path.stem, times, codes, source=path.name), carrying))
     return motions
 
@@ -681,8 +681,7 @@ def skeleton_notes(body: Body, path: Path) -> tuple[str, ...]:
     MeshFileError : the file is damaged, or the body has no matching skeleton.
     """
     motion = _read(path, most=_MOST_LOOKED_AT)[0]
-    notes = motion.notes if isinstance(motion, NodeMotion) else ()
-    rested = Retargeting.of(motion, rig_space_of(body, path), path).motion
+    notes, rested = motion.notes, Retargeting.of(motion, rig_space_of(body, path), path).motion
     if rested.turns_y_up:
         return (*notes, f"{path.name} stands along y at rest and along z in its frames: z is up")
     if rested.up[0] or rested.up.min() < 0.0:
@@ -692,7 +691,7 @@ def skeleton_notes(body: Body, path: Path) -> tuple[str, ...]:
     if rested.frame is None:
         return notes
     at = f"frame {rested.frame} (from 0)"
-    if isinstance(motion, NodeMotion):
+    if path.suffix.lower() != BVH_SUFFIX:
         at = f"the frame at {motion.times[rested.frame]:.2f} s"
     measured = (
         f"the rest pose of {path.name} does not stand, so its joints are measured from {at}, "
@@ -707,10 +706,10 @@ _MOST_LOOKED_AT = 64
 
 def _read(
     path: Path, clip: str | None = None, fps: float | None = None, most: int | None = None
-) -> Sequence[Bvh | NodeMotion]:
+) -> list[SkeletonMotion]:
     """Read a moving skeleton; `most` limits the frames read of each clip of a scene."""
     if path.suffix.lower() == BVH_SUFFIX:
-        return [read_bvh(path)]
+        return [read_bvh(path).motion]
     if path.suffix.lower() == VRMA_SUFFIX:
         return [read_vrma(path, fps)]
     if is_generated(path):

@@ -9,9 +9,8 @@ orientation. It becomes the rest pose; the frames' poses do not change.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.skeletons import anatomy_of, axes_of, joint_roles, limb_children, rig_of
 from lcollision_core.files.character import Character, Rig
-from lcollision_core.files.motion.node_motion import least_turns
+from lcollision_core.files.motion.skeleton import SkeletonMotion, least_turns
 from lcollision_core.meshes.joint_kinds import Role, Side, part_names
 from lcollision_core.meshes.topology import FloatArray, Topology
 
@@ -41,93 +40,58 @@ _SHORT = 1e-9
 _AS_ON_AVERAGE = (Role.FOOT, Role.HAND, Role.NECK, Role.HEAD)
 
 
-class SkeletonMotion(Protocol):
-    """A moving skeleton of J joints whose axes all coincide at rest; see `Bvh`."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """J names."""
-
-    @property
-    def parents(self) -> npt.NDArray[np.int64]:
-        """(J,) -1 for a root; parents come before children."""
-
-    @property
-    def offsets(self) -> FloatArray:
-        """(J, 3) rest position of each joint relative to its parent."""
-
-    @property
-    def ends(self) -> FloatArray:
-        """(J, 3) ends of the bones relative to their joints; NaN if unknown."""
-
-    def __len__(self) -> int:
-        """T, the number of frames."""
-
-    def rotations(self) -> FloatArray:
-        """(T, J, 3, 3) rotations of the joints relative to their parents; the caller may modify."""
-
-    def positions(self) -> FloatArray:
-        """(T, J, 3) positions of the joints relative to their parents; the caller may modify."""
-
-
-@dataclass(frozen=True, eq=False)
-class ReposedMotion:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ReposedMotion(SkeletonMotion):
     """The same motion with another rest pose.
 
     Attributes
     ----------
-    stored : the skeleton as in its file
     rest_turns : (J, 3, 3) world rotations of its joints in the new rest pose
     up : (3,) unit vector, an axis, y or z in most files
     front : (3,) unit vector, an axis; None to take it from the file's own rest pose
-    frame : the frame that the rest pose was taken from; None for the file's own
+    frame : the frame that the rest pose was taken from, with the root at 0; None for the file's own
     """
 
-    stored: SkeletonMotion
-    rest_turns: FloatArray
     up: FloatArray
+    rest_turns: FloatArray
     front: FloatArray | None = None
     frame: int | None = None
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """J names."""
-        return self.stored.names
-
-    @property
-    def parents(self) -> npt.NDArray[np.int64]:
-        """(J,) -1 for a root."""
-        return self.stored.parents
-
-    @property
-    def offsets(self) -> FloatArray:
-        """(J, 3) rest position of each joint relative to its parent; roots at 0 if from a frame."""
-        offsets: FloatArray = np.einsum("jxy,jy->jx", self._above(), self.stored.offsets)
-        return offsets if self.frame is None else offsets * (self.parents >= 0)[:, None]
-
-    @property
-    def ends(self) -> FloatArray:
-        """(J, 3) ends of the bones relative to their joints."""
-        ends: FloatArray = np.einsum("jxy,jy->jx", self.rest_turns, self.stored.ends)
-        return ends
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self.stored)
-
-    def rotations(self) -> FloatArray:
-        """Return (T, J, 3, 3) rotations of the joints relative to their parents."""
-        turns: FloatArray = self._above() @ self.stored.rotations()
-        return turns @ np.swapaxes(self.rest_turns, 1, 2)
-
-    def positions(self) -> FloatArray:
-        """Return (T, J, 3) positions of the joints relative to their parents."""
-        places: FloatArray = np.einsum("jxy,tjy->tjx", self._above(), self.stored.positions())
-        return places
+    @classmethod
+    def of(
+        cls,
+        stored: SkeletonMotion,
+        rest_turns: FloatArray,
+        up: FloatArray,
+        front: FloatArray | None = None,
+        frame: int | None = None,
+    ) -> ReposedMotion:
+        """Give the skeleton of a file another rest pose."""
+        above = _above(stored.parents, rest_turns)
+        offsets = np.einsum("jxy,jy->jx", above, stored.offsets)
+        if frame is not None:
+            offsets = offsets * (stored.parents >= 0)[:, None]
+        return cls(
+            name=stored.name,
+            names=stored.names,
+            parents=stored.parents,
+            offsets=offsets,
+            ends=np.einsum("jxy,jy->jx", rest_turns, stored.ends),
+            axes=stored.axes,
+            times=stored.times,
+            turns=above @ stored.turns @ np.swapaxes(rest_turns, 1, 2),
+            places=np.einsum("jxy,tjy->tjx", above, stored.places),
+            notes=stored.notes,
+            rest_turns=rest_turns,
+            up=up,
+            front=front,
+            frame=frame,
+        )
 
     def turns_as_stored(self, turns: FloatArray) -> FloatArray:
         """Convert (n, J, 3, 3) rotations relative to the parents to those of the file."""
-        stored: FloatArray = np.swapaxes(self._above(), 1, 2) @ turns @ self.rest_turns
+        above = _above(self.parents, self.rest_turns)
+        stored: FloatArray = np.swapaxes(above, 1, 2) @ turns @ self.rest_turns
         return stored
 
     @property
@@ -135,11 +99,12 @@ class ReposedMotion:
         """Whether the file's own rest pose has y up, and its frames z."""
         return self.frame is None and np.array_equal(self.rest_turns[0], _TO_Z_UP)
 
-    def _above(self) -> FloatArray:
-        """Return the world rotation of each joint's parent at rest."""
-        is_root = (self.parents < 0)[:, None, None]
-        above: FloatArray = np.where(is_root, np.eye(3), self.rest_turns[self.parents])
-        return above
+
+def _above(parents: npt.NDArray[np.int64], rest_turns: FloatArray) -> FloatArray:
+    """Return the world rotation of each joint's parent at rest."""
+    is_root = (parents < 0)[:, None, None]
+    above: FloatArray = np.where(is_root, np.eye(3), rest_turns[parents])
+    return above
 
 
 @dataclass(frozen=True)
@@ -208,7 +173,6 @@ def with_standing_rest(motion: SkeletonMotion) -> ReposedMotion:
     """
     rest = rest_places(motion)
     own_turns = np.broadcast_to(np.eye(3), (len(motion.names), 3, 3))
-    as_stored = ReposedMotion(motion, own_turns, longer_axis(rest))
     samples = np.linspace(0, len(motion) - 1, min(len(motion), _MOST_SAMPLES)).round().astype(int)
     turns, places = in_world(motion, samples)
     marks = _named_landmarks(motion, rest)
@@ -226,24 +190,24 @@ def with_standing_rest(motion: SkeletonMotion) -> ReposedMotion:
             default=None,
         )
     if marks is None:
-        return as_stored
+        return ReposedMotion.of(motion, own_turns, longer_axis(rest))
     way, mean = marks.trunk(rest), marks.trunk(places).mean(axis=0)
     up = np.eye(3)[2 if mean[2] > max(mean[1], _UPRIGHT) else 1]
     if marks == of_rest:
         if way[1] > _UPRIGHT and _stands_on_z(marks, rest, places):
-            return ReposedMotion(motion, np.broadcast_to(_TO_Z_UP, own_turns.shape), up)
+            return ReposedMotion.of(motion, np.broadcast_to(_TO_Z_UP, own_turns.shape), up)
         if max(way[1], way @ up) > _UPRIGHT or mean @ up < _UPRIGHT:
             axis = int(np.abs(way).argmax())
-            return replace(as_stored, up=np.sign(way[axis]) * np.eye(3)[axis])
+            return ReposedMotion.of(motion, own_turns, np.sign(way[axis]) * np.eye(3)[axis])
     best = int(np.argmax([_likeness(marks, shown, up) for shown in places]))
     if not marks.stand(places[best]):
-        return as_stored
+        return ReposedMotion.of(motion, own_turns, longer_axis(rest))
     hips = marks.axes(places[best], marks.thighs)
     level = hips[:, 2] * (1.0 - up)
     front = np.sign(level[np.abs(level).argmax()]) * np.eye(3)[np.abs(level).argmax()]
     upright = axes_of(up, front)
     rested = _plain_pose(motion, marks, turns, places[best], best, upright)
-    return ReposedMotion(motion, rested, up, front, int(samples[best]))
+    return ReposedMotion.of(motion, rested, up, front, int(samples[best]))
 
 
 def _stands_on_z(marks: _Landmarks, rest: FloatArray, places: FloatArray) -> bool:
@@ -346,7 +310,7 @@ def in_world(
     motion: SkeletonMotion, frames: npt.NDArray[np.int64] | slice = slice(None)
 ) -> tuple[FloatArray, FloatArray]:
     """Return world rotations (T, J, 3, 3) and positions (T, J, 3) of the joints in some frames."""
-    turns, places = motion.rotations()[frames], motion.positions()[frames]
+    turns, places = motion.turns[frames].copy(), motion.places[frames].copy()
     for joint, parent in enumerate(motion.parents.tolist()):
         if parent >= 0:
             moved = np.einsum("txy,ty->tx", turns[:, parent], places[:, joint])

@@ -157,8 +157,22 @@ def _listed(
             (rules.shape_touching, TOUCHING_RADIUS),
         )
     )
-    regions = region, ignored, squared_tolerance
-    return Exclusions(topology.faces, *near, *by_rest, *regions, *by_joint, *by_touch, *by_shape)
+    return Exclusions(
+        corners=topology.faces,
+        near_start=near.start,
+        near=near.entry,
+        start=by_rest.start,
+        face=by_rest.entry,
+        region=region,
+        ignored=ignored,
+        squared_tolerance=squared_tolerance,
+        joint_start=by_joint.start,
+        joint=by_joint.entry,
+        touching_start=by_touch.start,
+        touching=by_touch.entry,
+        shape_start=by_shape.start,
+        shape=by_shape.entry,
+    )
 
 
 def _faces_of(patches: Sequence[tuple[int, int]], n_faces: int) -> Pairs:

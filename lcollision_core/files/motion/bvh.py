@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.mesh.text import number_rows
+from lcollision_core.files.motion.skeleton import SkeletonMotion
 from lcollision_core.files.safe import read_regular
 from lcollision_core.meshes.topology import FloatArray
 
@@ -75,6 +76,22 @@ class Bvh:
     def times(self) -> FloatArray:
         """(T,) times in seconds, from 0."""
         return np.arange(len(self), dtype=np.float64) * self.frame_time
+
+    @property
+    def motion(self) -> SkeletonMotion:
+        """The skeleton and its motion, apart from the file's text."""
+        return SkeletonMotion(
+            name="",
+            names=self.names,
+            parents=self.parents,
+            offsets=self.offsets,
+            ends=self.ends,
+            axes=None,
+            times=self.times,
+            up=None,
+            turns=self.rotations(),
+            places=self.positions(),
+        )
 
     def rotations(self) -> FloatArray:
         """Return the (T, J, 3, 3) rotations of the joints relative to their parents."""

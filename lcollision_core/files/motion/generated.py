@@ -20,7 +20,11 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.files.motion.node_motion import NodeMotion, least_turns, relative_to_parents
+from lcollision_core.files.motion.skeleton import (
+    SkeletonMotion,
+    least_turns,
+    relative_to_parents,
+)
 from lcollision_core.files.motion.smpl import BODY_JOINTS, array_names
 from lcollision_core.files.safe import open_regular, read_header, read_npz
 from lcollision_core.meshes.topology import FloatArray
@@ -96,7 +100,7 @@ def holds_joints(path: str | os.PathLike[str]) -> bool:
     return dtype.hasobject or shape[1:] in (_JOINTS, _VECTORS)
 
 
-def read_generated(path: str | os.PathLike[str]) -> list[NodeMotion]:
+def read_generated(path: str | os.PathLike[str]) -> list[SkeletonMotion]:
     """Read motions in metres: several from an MDM file, one from others.
 
     Raises
@@ -205,7 +209,7 @@ def _joints_of_vectors(vectors: FloatArray) -> FloatArray:
     return np.concatenate([roots[:, None], places], axis=1)
 
 
-def _of_sample(name: str, places: FloatArray, what: str) -> NodeMotion:
+def _of_sample(name: str, places: FloatArray, what: str) -> SkeletonMotion:
     n_frames, cut = _filled(places)
     motion = _fitted(places[:n_frames], what)
     return replace(motion, name=name, notes=(*motion.notes, *cut))
@@ -226,7 +230,7 @@ def _motion(
     turns: FloatArray,
     rate: float,
     notes: tuple[str, ...],
-) -> NodeMotion:
+) -> SkeletonMotion:
     """Return the motion of joints with these global positions and rotations."""
     parents = np.array(list(skeleton.values()))
     local, root_places = relative_to_parents(parents, turns, places)
@@ -234,12 +238,12 @@ def _motion(
     axes = np.broadcast_to(np.eye(3), (len(parents), 3, 3)).copy()
     times, ends = np.arange(len(places)) / rate, np.full(offsets.shape, np.nan)
     names = tuple(skeleton)
-    return NodeMotion(
+    return SkeletonMotion(
         "", names, parents, offsets, ends, axes, times, None, local, root_places, notes
     )
 
 
-def _fitted(places: FloatArray, what: str) -> NodeMotion:
+def _fitted(places: FloatArray, what: str) -> SkeletonMotion:
     """Return a motion of SMPL's joints with rotations fitted to (T, 22, 3) positions."""
     names, parents = list(_SMPL), np.array(list(_SMPL.values()))
     turns = np.broadcast_to(np.eye(3), (*places.shape, 3)).copy()

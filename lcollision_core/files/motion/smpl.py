@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bundled import bundled_table
 from lcollision_core.errors import LCollisionError, MeshFileError
-from lcollision_core.files.motion.node_motion import NodeMotion
+from lcollision_core.files.motion.skeleton import SkeletonMotion
 from lcollision_core.files.safe import ZIP_DAMAGE, read_npz
 from lcollision_core.files.scene.transforms import nearest_winding
 from lcollision_core.files.table import SMPL_SUFFIX
@@ -623,7 +623,7 @@ def axes_of_smpl(motion: SmplMotion) -> FloatArray:
     return _FROM_Z_UP if z > y else np.eye(3)
 
 
-def skeleton_of_smpl(motion: SmplMotion, nominal_rate: float) -> NodeMotion:
+def skeleton_of_smpl(motion: SmplMotion, nominal_rate: float) -> SkeletonMotion:
     """Return a motion as that of a skeleton of average build, y up.
 
     Parameters
@@ -654,6 +654,6 @@ def skeleton_of_smpl(motion: SmplMotion, nominal_rate: float) -> NodeMotion:
     ends, axes = np.full(offsets.shape, np.nan), np.tile(np.eye(3), (len(order), 1, 1))
     note = "read as an SMPL motion and retargeted; its body shape ('betas') is ignored"
     notes = (note, *motion.notes)
-    return NodeMotion(
+    return SkeletonMotion(
         "", tuple(order), parents, offsets, ends, axes, times, None, turns, places, notes
     )

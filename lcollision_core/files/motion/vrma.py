@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.gltf.read import human_bones, read_nodes
 from lcollision_core.files.gltf.schema import GltfDocument, extension_of, inner
-from lcollision_core.files.motion.node_motion import NodeMotion, motion_of_nodes
+from lcollision_core.files.motion.skeleton import SkeletonMotion, motion_of_nodes
 from lcollision_core.files.safe import read_regular
 from lcollision_core.files.scene.scene import left_out_note, parents_first
 from lcollision_core.files.scene.transforms import signs_on_one_side
@@ -23,7 +23,7 @@ from lcollision_core.meshes.topology import FloatArray
 _MOST_BYTES = 1 << 30
 
 
-def read_vrma(path: str | os.PathLike[str], fps: float | None = None) -> NodeMotion:
+def read_vrma(path: str | os.PathLike[str], fps: float | None = None) -> SkeletonMotion:
     """Read the first animation of a VRMA file.
 
     Parameters
@@ -40,7 +40,7 @@ def read_vrma(path: str | os.PathLike[str], fps: float | None = None) -> NodeMot
         raise MeshFileError.unreadable(path, error, "export the animation again") from error
 
 
-def _motion(document: GltfDocument, fps: float | None) -> NodeMotion:
+def _motion(document: GltfDocument, fps: float | None) -> SkeletonMotion:
     scene, bones = read_nodes(document), human_bones(document)
     order = [node for node in parents_first(scene.parents) if node in bones]
     if not order or not scene.clips:

@@ -107,7 +107,7 @@ def test_limbs_point_as_those_of_another_skeleton_do(tmp_path: Path) -> None:
     roots = np.array([[0.0, 38.7, 0.0]] * n_frames) + np.outer(np.arange(n_frames), [3, 1, 2])
     path = tmp_path / "capture.bvh"
     bvh = foreign(path, turns, roots)
-    transforms = Retargeting.of(bvh, body.space, path).transforms()
+    transforms = Retargeting.of(bvh.motion, body.space, path).transforms()
     ours = list(body.space.rig.joint_names)
     world, places = turns.copy(), np.empty((n_frames, len(names), 3))
     for joint, (name, offset) in enumerate(FOREIGN.values()):
@@ -286,7 +286,7 @@ def test_a_rig_without_one_root_leaves_the_skeleton_in_its_place(tmp_path: Path)
     parents[rig.joint_names.index("Spine")] = -1
     loose = RigBody.of(replace(rigged_body(), rig=replace(rig, parents=parents))).space
     assert loose.joint_of_code[0] == -1
-    retargeting = Retargeting.of(bvh, loose, path)
+    retargeting = Retargeting.of(bvh.motion, loose, path)
     before = retargeting.transforms()
     np.testing.assert_allclose(before[..., :3, 3], [rig.rest[:, :3, 3]] * 2, atol=1e-6)
     after = before.copy()

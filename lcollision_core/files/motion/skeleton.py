@@ -1,4 +1,4 @@
-"""Motions of a scene's nodes as a skeleton, with or without meshes."""
+"""A skeleton in motion, and how it is made of the nodes of a scene, with or without meshes."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _SHORT = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class NodeMotion:
-    """A skeleton in motion, in the file's unit; implements `standing_pose.SkeletonMotion`.
+class SkeletonMotion:
+    """A skeleton in motion, in the file's unit, whatever the format.
 
     Attributes
     ----------
@@ -34,10 +34,13 @@ class NodeMotion:
     names : J names of the joints
     parents : (J,) int64 array, -1 for a root; parents come before children
     offsets : (J, 3) rest position of each joint relative to its parent
-    ends : (J, 3), NaN, as nodes do not define where bones end
-    axes : (J, 3, 3) rotations from each joint's local axes to the world at rest
+    ends : (J, 3) ends of the bones relative to their joints; NaN if unknown
+    axes : (J, 3, 3) rotations from each joint's local axes to the world at rest; None for BVH,
+        whose joints all have the same
     times : (T,) in seconds, from 0
     up : (3,) unit vector, an axis; None if the file does not define it
+    turns : (T, J, 3, 3) rotations of the joints from rest, relative to their parents
+    places : (T, J, 3) positions of the joints relative to their parents; a root's is global
     notes : sentences on what was left out
     """
 
@@ -46,24 +49,16 @@ class NodeMotion:
     parents: npt.NDArray[np.int64]
     offsets: FloatArray
     ends: FloatArray
-    axes: FloatArray
+    axes: FloatArray | None
     times: FloatArray
     up: FloatArray | None
-    _turns: FloatArray
-    _places: FloatArray
+    turns: FloatArray
+    places: FloatArray
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return T, the number of frames."""
         return len(self.times)
-
-    def rotations(self) -> FloatArray:
-        """Return the (T, J, 3, 3) rotations of the joints from rest, relative to their parents."""
-        return self._turns.copy()
-
-    def positions(self) -> FloatArray:
-        """Return the (T, J, 3) positions of joints relative to parents; a root's is global."""
-        return self._places.copy()
 
 
 def motion_of_nodes(
@@ -72,7 +67,7 @@ def motion_of_nodes(
     nodes: Sequence[int],
     names: Sequence[str],
     fps: float | FloatArray | None = None,
-) -> NodeMotion:
+) -> SkeletonMotion:
     """Return the motion of some nodes of a scene; scales are ignored.
 
     Parameters
@@ -108,7 +103,7 @@ def motion_of_nodes(
             offsets[joint] = changed[parent] @ (rest[joint, :3, 3] - rest[parent, :3, 3])
     ends = np.full(offsets.shape, np.nan)
     since, up = times - times[0], scene.up
-    return NodeMotion(
+    return SkeletonMotion(
         clip.name, tuple(names), parents, offsets, ends, axes, since, up, turns, places
     )
 
@@ -129,7 +124,7 @@ def relative_to_parents(
 
 def motions_of_scene(
     scene: Scene, clip: str | None = None, fps: float | None = None, most: int | None = None
-) -> list[NodeMotion]:
+) -> list[SkeletonMotion]:
     """Return the motions of a scene's skeleton by its clips.
 
     Parameters
