@@ -1,4 +1,4 @@
-"""The files that ship with the program, wherever it is installed."""
+"""The files that ship with the program, wherever it is installed, and the user's folders."""
 
 from __future__ import annotations
 
@@ -28,6 +28,13 @@ def bundled_file(*parts: str) -> Path:
 def bundled_folder(name: str) -> Path:
     """Return the path of a folder in ``resources/``, such as "models"; it may not exist."""
     return Path(str(resources.files("resources").joinpath(name)))
+
+
+def user_folder(name: str) -> Path:
+    """Return a folder of the user's data, such as "models", which may not exist yet."""
+    from platformdirs import user_data_path
+
+    return user_data_path("lcollision", appauthor=False) / name
 
 
 def bundled_table(name: str, kind: type[T]) -> T:

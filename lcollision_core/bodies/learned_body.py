@@ -22,7 +22,7 @@ from lcollision_core.bodies.names import (
     names_from_labels,
     numbered_names,
 )
-from lcollision_core.bundled import bundled_folder
+from lcollision_core.bundled import bundled_folder, user_folder
 from lcollision_core.embedding.bilevel import BOX_ARRAYS, Embedding, LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.files import (
@@ -79,9 +79,7 @@ class ListedModel:
 
 def user_models_folder() -> Path:
     """Return the folder of the user's own models, which may not exist yet."""
-    from platformdirs import user_data_path
-
-    return user_data_path("lcollision", appauthor=False) / "models"
+    return user_folder("models")
 
 
 def list_models() -> tuple[ListedModel, ...]:

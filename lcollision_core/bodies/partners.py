@@ -31,6 +31,7 @@ from lcollision_core.bodies.skeletons import (
     role_of_word,
 )
 from lcollision_core.bodies.standing_pose import common_ancestor
+from lcollision_core.bundled import user_folder
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.files import Character
 from lcollision_core.files.motion.skeleton import SkeletonMotion
@@ -278,12 +279,10 @@ def remember_followed(match: JointMatch, followed: JointMap) -> None:
 
 
 def _path(source_joints: Sequence[str], rig_joints: Sequence[str]) -> Path:
-    from platformdirs import user_data_path
-
     digest = hashlib.sha256(
         json.dumps([list(source_joints), list(rig_joints)]).encode()
     ).hexdigest()[:16]
-    return user_data_path("lcollision", appauthor=False) / "joints" / f"{digest}.json"
+    return user_folder("joints") / f"{digest}.json"
 
 
 def match_by_name(motion: SkeletonMotion, space: RigPoseSpace) -> npt.NDArray[np.int64]:

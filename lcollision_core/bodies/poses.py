@@ -26,6 +26,7 @@ from lcollision_core.bodies.learned_body import ListedModel, find_latent_space, 
 from lcollision_core.bodies.mirror import MirroredPose, MirrorSource, Symmetry, pose_bytes
 from lcollision_core.bodies.names import BETWEEN_BODIES, MAX_POSE_NAME_LENGTH, unique_names
 from lcollision_core.bodies.remembered import find_character
+from lcollision_core.bundled import user_folder
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.files import (
     FileStamp,
@@ -523,9 +524,7 @@ _MAX_NAME = 60
 
 def user_poses_folder() -> Path:
     """Return the folder of the user's pose libraries, which may not exist yet."""
-    from platformdirs import user_data_path
-
-    return user_data_path("lcollision", appauthor=False) / "poses"
+    return user_folder("poses")
 
 
 @dataclass(frozen=True, eq=False)

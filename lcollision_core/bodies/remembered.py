@@ -20,6 +20,7 @@ from msgspec import Meta
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.learned_body import LearnedBody, ListedModel
 from lcollision_core.bodies.rig_body import RigBody
+from lcollision_core.bundled import user_folder
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError, ShapeError
 from lcollision_core.files import (
     Character,
@@ -73,9 +74,7 @@ class RememberedChoices:
 
 def user_characters_folder() -> Path:
     """Return the folder of remembered characters, which may not exist yet."""
-    from platformdirs import user_data_path
-
-    return user_data_path("lcollision", appauthor=False) / "characters"
+    return user_folder("characters")
 
 
 def known_character(fingerprint: str) -> RememberedChoices | None:

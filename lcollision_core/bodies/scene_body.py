@@ -31,7 +31,7 @@ from lcollision_core.bodies.scene_space import PlacedSpace, SceneSpace, StillSpa
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding.bilevel import LatentFit
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files.scene.appearance import Appearance, Material, join_appearances
+from lcollision_core.files.scene.appearance import Appearance, join_appearances
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import FaceGroup, RigidTransform, Topology
 from lcollision_core.meshes.face_groups import MAX_GROUPS
@@ -515,7 +515,10 @@ class SceneBody(Body):
         bodies = [member.body for member in members]
         if all(body.appearance is None for body in bodies):
             return None
-        looks = [body.appearance or _plain(body) for body in bodies]
+        looks = [
+            body.appearance or Appearance.plain(body.n_vertices, body.faces.astype(np.int64))
+            for body in bodies
+        ]
         counts = [body.n_vertices for body in bodies]
         return join_appearances(looks, counts, np.arange(self.n_vertices))
 
@@ -799,19 +802,6 @@ class SceneResolver(PoseResolver):
 def _bends(body: Body) -> bool:
     """Whether a posable body has parts that move relative to each other."""
     return len(body.space.low) > body.space.group_sizes[0]
-
-
-def _plain(body: Body) -> Appearance:
-    """Return a plain white appearance for a body without one."""
-    n = body.n_vertices
-    return Appearance(
-        np.arange(n),
-        body.faces.astype(np.int64),
-        np.zeros((n, 2), dtype=np.float32),
-        np.full((n, 4), 255, dtype=np.uint8),
-        np.zeros(len(body.faces), dtype=np.int64),
-        (Material(),),
-    )
 
 
 def _row(

@@ -36,6 +36,7 @@ from lcollision_core.bodies.scene_file import (
     read_scene_file,
     write_scene_file,
 )
+from lcollision_core.bundled import user_folder
 from lcollision_core.errors import LCollisionError, PoseSetError
 from lcollision_core.files.table import POSES_SUFFIX, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
@@ -181,9 +182,7 @@ def kept_scene(scene: SceneFile) -> Path:
     ------
     MeshFileError : it cannot be written.
     """
-    from platformdirs import user_data_path
-
-    folder = user_data_path("lcollision", appauthor=False) / "scenes"
+    folder = user_folder("scenes")
     folder.mkdir(parents=True, exist_ok=True)
     names = " + ".join(Path(part.file).stem for part in scene.bodies)[:80]
     path = folder / f"{names} {digest_of(repr((scene.bodies, scene.ground)), {})[:8]}.json"

@@ -371,15 +371,7 @@ def _look(part: Part) -> Appearance:
     read = part.shaded_look or part.look
     if read is not None:
         return read()
-    n = len(part.points)
-    return Appearance(
-        np.arange(n),
-        part.faces,
-        np.zeros((n, 2), np.float32),
-        np.full((n, 4), 255, np.uint8),
-        np.zeros(len(part.faces), np.int64),
-        (Material(),),
-    )
+    return Appearance.plain(len(part.points), part.faces)
 
 
 def _ordered(look: Appearance, n_vertices: int) -> Appearance:

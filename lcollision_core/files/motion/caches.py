@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -48,8 +49,17 @@ def read_point_cache(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
     MeshFileError : the file is missing, truncated, of another format, announces more than it holds
         or more than `MAX_ITEMS` numbers, or a coordinate is not finite.
     """
-    with _opened(path) as (file, size):
-        frames = _read_mdd(file, size) if _suffix(path) == ".mdd" else _read_pc2(file, size)
+    with _opened(path) as file:
+        layout = _layout(file, _suffix(path))
+        shape = layout.n_frames, layout.n_points, 3
+        if 3 * layout.n_frames * layout.n_points > MAX_ITEMS:
+            raise MeshFileError(
+                f"it holds {layout.n_frames} frames of {layout.n_points} vertices, at most "
+                f"{MAX_ITEMS} coordinates can be read",
+                "keep fewer frames",
+            )
+        data = np.frombuffer(file.read(4 * math.prod(shape)), layout.dtype)
+        frames = data.astype(np.float32, copy=False).reshape(shape)
     for index, frame in enumerate(frames):
         if not np.isfinite(frame).all():
             vertex = int(np.flatnonzero(~np.isfinite(frame).all(axis=1))[0])
@@ -72,78 +82,71 @@ def cache_rate(path: str | os.PathLike[str]) -> float | None:
     """
     if Path(path).suffix.lower() != ".mdd":
         return None
-    with _opened(path) as (file, size):
-        times = _mdd_times(file, size)[1]
+    with _opened(path) as file:
+        times = _layout(file, ".mdd").times
     steps = np.diff(times.astype(np.float64))
     rate = 1.0 / float(np.median(steps)) if len(steps) and (steps > 0.0).all() else 0.0
     return rate or None
 
 
 @contextmanager
-def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[BinaryIO, int]]:
-    """Open a cache and yield it with its size; errors name its path."""
+def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a cache; errors name its path."""
     try:
         with open_regular(path) as file:
-            yield file, os.fstat(file.fileno()).st_size
+            yield file
     except (MeshFileError, OSError, MemoryError) as error:
         reason = error if str(error) else "it needs more memory than there is"
         raise MeshFileError.unreadable(path, reason, "export the cache again") from error
 
 
-def _read_pc2(file: BinaryIO, size: int) -> npt.NDArray[np.float32]:
-    header = _header(file, _PC2_HEADER, size)
-    if bytes(header["magic"]) != _PC2_MAGIC.rstrip(b"\0"):
-        raise MeshFileError("it does not begin with POINTCACHE2, so it is not a PC2 file")
-    if header["version"] != 1:
-        raise MeshFileError(f"its version is {header['version']}, only 1 is known")
-    return _frames(file, header, size - _PC2_HEADER.itemsize, "<f4")
+class _Layout(NamedTuple):
+    """What the head of a cache says.
+
+    Attributes
+    ----------
+    n_frames, n_points : above 0
+    dtype : of the coordinates
+    times : (N,) seconds of the frames; empty for PC2, which has none
+    """
+
+    n_frames: int
+    n_points: int
+    dtype: str
+    times: npt.NDArray[np.float32]
 
 
-def _read_mdd(file: BinaryIO, size: int) -> npt.NDArray[np.float32]:
-    header, times = _mdd_times(file, size)
-    return _frames(file, header, size - _MDD_HEADER.itemsize - times.nbytes, ">f4")
+def _layout(file: BinaryIO, suffix: str) -> _Layout:
+    """Read the head of a cache, up to its first frame.
 
-
-def _mdd_times(file: BinaryIO, size: int) -> tuple[Any, npt.NDArray[np.float32]]:
-    """Read the header and the times of the frames, which follow it."""
-    header = _header(file, _MDD_HEADER, size)
-    n_bytes = 4 * max(int(header["n_frames"]), 0)
-    _require_whole(header, size - _MDD_HEADER.itemsize - n_bytes)
-    return header, np.frombuffer(file.read(n_bytes), ">f4")
-
-
-def _header(file: BinaryIO, layout: np.dtype[Any], size: int) -> Any:
-    if size < layout.itemsize:
+    Raises
+    ------
+    MeshFileError : it is of another format, or announces more than the file holds.
+    """
+    is_mdd, size = suffix == ".mdd", os.fstat(file.fileno()).st_size
+    form = _MDD_HEADER if is_mdd else _PC2_HEADER
+    if size < form.itemsize:
         raise MeshFileError(f"it has {size} bytes, too few for a point cache")
-    data = file.read(layout.itemsize)
-    both = [np.frombuffer(data, own)[0] for own in (layout, layout.newbyteorder("S"))]
-    n_bytes, swapped = (12 * int(header["n_frames"]) * int(header["n_points"]) for header in both)
-    if not 0 < n_bytes <= size and 0 < swapped <= size and both[1]["n_points"] > 0:
+    data = file.read(form.itemsize)
+    header, swapped = (np.frombuffer(data, own)[0] for own in (form, form.newbyteorder("S")))
+    n_frames, n_points = int(header["n_frames"]), int(header["n_points"])
+    n_bytes = 12 * n_frames * n_points
+    n_swapped = 12 * int(swapped["n_frames"]) * int(swapped["n_points"])
+    if not 0 < n_bytes <= size and 0 < n_swapped <= size and swapped["n_points"] > 0:
         raise MeshFileError("its numbers are in the wrong byte order")
-    return both[0]
-
-
-def _frames(file: BinaryIO, header: Any, n_bytes: int, dtype: str) -> npt.NDArray[np.float32]:
-    _require_whole(header, n_bytes)
-    n_frames, n_points = int(header["n_frames"]), int(header["n_points"])
-    if 3 * n_frames * n_points > MAX_ITEMS:
-        raise MeshFileError(
-            f"it holds {n_frames} frames of {n_points} vertices, at most {MAX_ITEMS} coordinates "
-            "can be read",
-            "keep fewer frames",
-        )
-    data = np.frombuffer(file.read(12 * n_frames * n_points), dtype)
-    return data.astype(np.float32, copy=False).reshape(n_frames, n_points, 3)
-
-
-def _require_whole(header: Any, n_bytes: int) -> None:
-    """Refuse a cache with fewer bytes than its announced frames need."""
-    n_frames, n_points = int(header["n_frames"]), int(header["n_points"])
-    if n_frames < 1 or n_points < 1 or 12 * n_frames * n_points > n_bytes:
+    if not is_mdd and bytes(header["magic"]) != _PC2_MAGIC.rstrip(b"\0"):
+        raise MeshFileError("it does not begin with POINTCACHE2, so it is not a PC2 file")
+    if not is_mdd and header["version"] != 1:
+        raise MeshFileError(f"its version is {header['version']}, only 1 is known")
+    n_bytes_of_times = 4 * max(n_frames, 0) if is_mdd else 0
+    n_left = size - form.itemsize - n_bytes_of_times
+    if n_frames < 1 or n_points < 1 or n_bytes > n_left:
         raise MeshFileError(
             f"it is truncated or damaged: it announces {n_frames} frames of {n_points} vertices, "
-            f"and holds {max(n_bytes, 0)} bytes for them"
+            f"and holds {max(n_left, 0)} bytes for them"
         )
+    times = np.frombuffer(file.read(n_bytes_of_times), ">f4")
+    return _Layout(n_frames, n_points, ">f4" if is_mdd else "<f4", times)
 
 
 def write_point_cache(
@@ -213,7 +216,7 @@ def read_frame(
     """Read one (V, 3) frame of a point cache that `point_cache` wrote."""
     is_mdd = _suffix(path) == ".mdd"
     head = _MDD_HEADER.itemsize + 4 * n_frames if is_mdd else _PC2_HEADER.itemsize
-    with _opened(path) as (file, _):
+    with _opened(path) as file:
         file.seek(head + 12 * n_points * frame)
         data = np.frombuffer(file.read(12 * n_points), ">f4" if is_mdd else "<f4")
     return data.astype(np.float32).reshape(n_points, 3)

@@ -101,6 +101,18 @@ class Appearance:
     notes: tuple[str, ...] = ()
     normals: npt.NDArray[np.float32] | None = None
 
+    @classmethod
+    def plain(cls, n_vertices: int, faces: IntArray) -> Appearance:
+        """Return the appearance of a white mesh, with a point for each vertex."""
+        return cls(
+            np.arange(n_vertices),
+            faces,
+            np.zeros((n_vertices, 2), dtype=np.float32),
+            np.full((n_vertices, 4), 255, dtype=np.uint8),
+            np.zeros(len(faces), dtype=np.int64),
+            (Material(),),
+        )
+
     @property
     def is_plain(self) -> bool:
         """Whether the mesh is white all over, as without materials."""
