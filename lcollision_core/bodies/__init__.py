@@ -1,4 +1,4 @@
-"""A trained body: reads one file and offers everything that a front end needs."""
+"""Bodies that take poses: rigs, trained models, bare meshes, and scenes of several."""
 
 from lcollision_core.bodies.body import Body, EncodedPose, ModelCard
 from lcollision_core.bodies.export import (
@@ -56,6 +56,7 @@ from lcollision_core.bodies.poses import (
     with_detail,
     write_poses,
 )
+from lcollision_core.bodies.proposed_rules import ProposedRules, propose_rules, typical_poses
 from lcollision_core.bodies.remembered import (
     character_of_mesh,
     open_body,
@@ -68,14 +69,11 @@ from lcollision_core.bodies.rig_body import RigBody, poses_by_rig, rest_pose_set
 from lcollision_core.bodies.scene_body import SceneBody, as_scene
 from lcollision_core.bodies.scoring import (
     PoseKind,
-    ProposedRules,
     Verdicts,
     check_poses,
     estimated_free,
-    propose_rules,
     sample_poses,
     score_kinds,
-    typical_poses,
 )
 from lcollision_core.options import ExportAxes, ExportRequest
 

@@ -43,7 +43,7 @@ from lcollision_core.files.table import (
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import RuleOptions
 from lcollision_core.tasks.exporting import Output, write_result
-from lcollision_core.tasks.job import run_of_poses
+from lcollision_core.tasks.progress import run_of_poses
 from lcollision_core.tasks.words import fit_error, say, say_number
 
 _OF_MOTIONS = (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES)

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.bodies import LearnedBody, save_trained
-from lcollision_core.bodies.scoring import CARD_POSES, places_of, propose_rules, score_kinds
+from lcollision_core.bodies.proposed_rules import places_of, propose_rules
+from lcollision_core.bodies.scoring import CARD_POSES, score_kinds
 from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox, train_embedding
 from lcollision_core.embedding.bilevel import BOX_SCALE
 from lcollision_core.embedding.training_run import EmbeddingConfig, TrainingStatus

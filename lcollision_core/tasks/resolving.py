@@ -33,7 +33,7 @@ from lcollision_core.tasks.exporting import (
     write_result,
 )
 from lcollision_core.tasks.inputs import PARTIAL, InputPose, body_of_motion, motion_files
-from lcollision_core.tasks.job import Run, depends_on, key_of, run_of_poses, run_of_rows
+from lcollision_core.tasks.progress import Run, depends_on, key_of, run_of_poses, run_of_rows
 from lcollision_core.tasks.verdicts import FailedFile, ResolvedClip
 from lcollision_core.tasks.words import counted, say, say_number
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from lcollision_core.meshes import ContactRules
     from lcollision_core.motion import Motion, MotionReport, ScreenedMotion, Solved
     from lcollision_core.resolve import ResolveResult
-    from lcollision_core.tasks.job import Arrays, KeptPose
+    from lcollision_core.tasks.progress import Arrays, KeptPose
 
 _TABLE = "motions.csv"
 

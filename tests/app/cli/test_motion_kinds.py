@@ -233,14 +233,14 @@ def test_a_frame_that_is_no_number_is_said_in_one_sentence(
 _STOP_IN_THE_MIDDLE = """
 import os, signal, sys
 from app.cli import main
-from lcollision_core.tasks import job
-job._SECONDS_BETWEEN_WRITES, job._LARGEST_FRACTION = 0.0, 1.0
-keep, at = job.Run.keep, int(sys.argv.pop(1))
+from lcollision_core.tasks import progress
+progress._SECONDS_BETWEEN_WRITES, progress._LARGEST_FRACTION = 0.0, 1.0
+keep, at = progress.Run.keep, int(sys.argv.pop(1))
 def keep_some(self, *arguments):
     keep(self, *arguments)
     if len(self.done) >= at:
         os.kill(os.getpid(), signal.SIGKILL)
-job.Run.keep = keep_some
+progress.Run.keep = keep_some
 main.main()
 """
 

@@ -27,7 +27,7 @@ from lcollision_core.errors import ModelFileError
 from lcollision_core.files import as_stored, locked, read_mesh, write_mesh, write_pose_set
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.resolve import PoseResolver, find_free_poses
-from lcollision_core.tasks import job
+from lcollision_core.tasks import exporting, progress
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
 from tests.core.brute_force import all_pairs
@@ -534,15 +534,15 @@ def test_a_name_with_a_dot_that_is_no_format_is_a_folder(
 _STOP_AFTER_TWO = """
 import os, signal, sys
 from app.cli import main
-from lcollision_core.tasks import job
+from lcollision_core.tasks import progress
 how = getattr(signal, sys.argv.pop(1))
-job._SECONDS_BETWEEN_WRITES, job._LARGEST_FRACTION = 0.0, 1.0
-keep = job.Run.keep
+progress._SECONDS_BETWEEN_WRITES, progress._LARGEST_FRACTION = 0.0, 1.0
+keep = progress.Run.keep
 def keep_two(self, *arguments):
     keep(self, *arguments)
     if len(self.done) >= 2:
         os.kill(os.getpid(), how)
-job.Run.keep = keep_two
+progress.Run.keep = keep_two
 main.main()
 """
 
@@ -646,8 +646,9 @@ def test_a_full_disk_loses_nothing_of_what_an_earlier_run_left(
         raise ModelFileError("it cannot be written: No space left on device")
 
     with monkeypatch.context() as full:
-        full.setattr("lcollision_core.bodies.write_poses", write)
-        full.setattr(job, "_SECONDS_BETWEEN_WRITES", -1.0)
+        full.setattr(exporting, "write_poses", write)
+        full.setattr(progress, "write_poses", write)
+        full.setattr(progress, "_SECONDS_BETWEEN_WRITES", -1.0)
         result = lcollision("resolve", model_file, poses, "-o", out, "--workers", "1")
     assert result.exit_code == 2
     # Once for the stored progress, and once for the output.
