@@ -230,6 +230,8 @@ class ContactsDialog(Dialog):
         self.tolerate = push_button("Set", tip, self._add_tolerated)
         for box in (self.first, self.second):
             box.textActivated.connect(self._name_choice)
+            # Long names are cut.
+            box.currentTextChanged.connect(box.setToolTip)
         self.ignored.currentItemChanged.connect(self._name_item)
         self.ignored.itemChanged.connect(self._on_edited)
         called = labelled("Ignored pairs and parts", "title")

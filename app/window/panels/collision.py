@@ -609,8 +609,8 @@ class OutcomeCard(Card):
                 f"{before}, as before" if before == after else f"{before} → {after}"
             )
         mean, largest = result.vertex_distance_mean, result.vertex_distance_max
-        moved = f"{height_text(mean)} of the body size,\nat most {height_text(largest)}"
-        self._moved.setText("not at all" if result.latent_distance == 0.0 else moved)
+        moved = f"{height_text(mean)} of the body size, at most {height_text(largest)}"
+        self._moved.setText("not at all" if result.latent_distance == 0.0 else unbroken(moved))
         self._moved.setToolTip("Mean and maximum over the mesh")
         self._took.setText(_times(result.seconds, self._document.history.state.outcome_seconds))
         self._note.setText(heading(result.note or ""))
