@@ -403,6 +403,7 @@ def test_keys_move_a_focused_slider(
     assert np.array_equal(shown(window), decoded(window.document))
 
 
+@pytest.mark.own_window
 @pytest.mark.variants
 @pytest.mark.parametrize("of_words", [False, True], ids=["number", "words"])
 def test_the_window_s_shortcuts_work_while_a_field_has_the_keyboard(
