@@ -378,6 +378,20 @@ def windows(span: range, length: int, overlap: int) -> list[range]:
     return [range(start, min(start + length, span.stop)) for start in starts]
 
 
+def knots_of(free: npt.NDArray[np.bool_], spacing: int) -> npt.NDArray[np.bool_]:
+    """Return (n,) whether a frame is evenly spaced in, or ends, a run of free or colliding frames.
+
+    Parameters
+    ----------
+    free : (n,) whether each frame is free
+    spacing : >= 1
+    """
+    knots = np.zeros(len(free), dtype=np.bool_)
+    for run in (*runs(free), *runs(~free)):
+        knots[run.start : run.stop : spacing] = knots[run.stop - 1] = True
+    return knots
+
+
 NEAR_GROUND = 0.03
 """Normalised height above the motion's lowest point up to which parts may stand."""
 

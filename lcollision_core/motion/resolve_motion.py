@@ -20,6 +20,7 @@ from lcollision_core.motion.motion import (
     NOMINAL_RATE,
     Motion,
     colliding_spans,
+    knots_of,
     runs,
     standing_parts,
     windows,
@@ -521,32 +522,36 @@ class _Resolution:
         before = None if is_open else corrections(window.start - 2)
         is_open = begins if is_round else not self.is_cycle and window.stop == n
         after = corrections(window.stop) if ends and not is_open else None
-        start = np.zeros((len(window), motion.codes.shape[1]))
-        known = self.before[self._own(window)].copy()
-        knots = _knots(known, motion.in_frames(_SPACING))
-        near = before[1] if before is not None and not known[0] else None
+        was_free = self.before[self._own(window)]
+        near = before[1] if before is not None and not was_free[0] else None
         freed = self.freed[span] = {}
-        colliding = [[window.start + at for at in run if knots[at]] for run in runs(~known)]
-        for frame, correction in chain_corrections(frames, colliding, near, freed).items():
-            start[frame - window.start], known[frame - window.start] = correction, True
-        program = SpanProgram(
-            frames,
-            window,
-            start,
-            known,
-            before,
-            after,
-            self._smoothness,
-            [_fractions(self.substeps[at]) for at in self._own(window)],
-            knots,
-            is_round and len(window) == n,
-            tell,
-        )
-        try:
-            solution, free = program.solve()
-        except CancelledError:
-            freed |= {window.start + at: moved for at, moved in program.so_far().items()}
-            raise
+        fractions = [_fractions(self.substeps[at]) for at in self._own(window)]
+        # If few frames first do not free all, resolve each of them first.
+        for knots in (knots_of(was_free, motion.in_frames(_SPACING)), np.ones_like(was_free)):
+            start, known = np.zeros((len(window), motion.codes.shape[1])), was_free.copy()
+            colliding = [[window.start + at for at in run if knots[at]] for run in runs(~known)]
+            for frame, correction in chain_corrections(frames, colliding, near, freed).items():
+                start[frame - window.start], known[frame - window.start] = correction, True
+            program = SpanProgram(
+                frames,
+                window,
+                start,
+                known,
+                before,
+                after,
+                self._smoothness,
+                fractions,
+                knots,
+                is_round and len(window) == n,
+                tell,
+            )
+            try:
+                solution, free = program.solve()
+            except CancelledError:
+                freed |= {window.start + at: moved for at, moved in program.so_far().items()}
+                raise
+            if program.is_settled or knots.all():
+                break
         targets = motion.codes[window.start : window.stop]
         return list(zip(_added(targets, solution), free.tolist(), strict=True))
 
@@ -732,20 +737,6 @@ def _free_pairs(
     """Return the frames that, like the next one, are free and within a range."""
     usable = free[again] & np.isin(np.arange(len(again)), within)
     return np.flatnonzero(usable[:-1] & usable[1:])
-
-
-def _knots(free: npt.NDArray[np.bool_], spacing: int) -> npt.NDArray[np.bool_]:
-    """Choose evenly spaced frames, and the ends, of each run of free and of colliding frames.
-
-    Parameters
-    ----------
-    free : (n,) whether each frame is free
-    spacing : >= 1
-    """
-    knots = np.zeros(len(free), dtype=np.bool_)
-    for run in (*runs(free), *runs(~free)):
-        knots[run.start : run.stop : spacing] = knots[run.stop - 1] = True
-    return knots
 
 
 def _fractions(substeps: int) -> FloatArray:

@@ -372,7 +372,7 @@ class SpanProgram:
             if self._rounds < _PINNED_AT[1]:
                 least = self._cost(best.corrections)
             best = self._search(best)
-        best = self._settled_search(best, _ENOUGH * least)
+        best = self._best = self._settled_search(best, _ENOUGH * least)
         put_back: npt.NDArray[np.bool_] = ~best.is_free & self._is_known
         chosen = np.where(put_back[:, None], self._known - self._targets, best.corrections)
         return chosen, best.is_free | put_back
@@ -398,13 +398,18 @@ class SpanProgram:
                 best = solution
                 if after > (*before[:2], _SETTLED * before[2]):
                     break
-            elif gives_way or not self._gives_way:
+            elif gives_way or not self._gives_way or not self.knots.all():
                 break
         return best
 
+    @property
+    def is_settled(self) -> bool:
+        """Whether a search has freed all but the frames for which no free pose was found."""
+        return self._best is not None and self._is_settled(self._best)
+
     def so_far(self) -> dict[int, FloatArray]:
         """Return the (D,) corrections that free frames, if the search is stopped."""
-        if self._best is not None and self._is_settled(self._best):
+        if self._best is not None and self.is_settled:
             return dict(enumerate(self._best.corrections))
         freed = self._is_known & ~self._is_free_before
         return {at: self._known[at] - self._targets[at] for at in np.flatnonzero(freed).tolist()}
@@ -449,7 +454,11 @@ class SpanProgram:
         pinned: dict[int, FloatArray] = {}
         kernel, now, best = self._kernel(pinned), start, start
         least, n_stalled = start.lack, 0
-        for number in range(ROUNDS if begin is None else _FEW_ROUNDS):
+        n_rounds = ROUNDS if begin is None else _FEW_ROUNDS
+        if begin is None and self._watched.all() and not self.knots.all():
+            # Frames that still collide then are better resolved one by one.
+            n_rounds = _PINNED_AT[0]
+        for number in range(n_rounds):
             # Two pinned neighbours would leave a pose between them no way out.
             released = [at for at in now.between if at in pinned and (at + 1) % n in pinned]
             for at in released:

@@ -26,7 +26,7 @@ from lcollision_core.motion import (
     resolve_motion,
     screen_motion,
 )
-from lcollision_core.motion.motion import windows
+from lcollision_core.motion.motion import knots_of, windows
 from lcollision_core.resolve import ResolveOptions
 from tests.core.motion.swings import CLIP, swinging, swinging_body, through_the_trunk
 from tests.independent_check import crossing_pairs
@@ -341,3 +341,10 @@ def test_long_spans_are_cut_into_windows_that_overlap() -> None:
     assert cut[-1].stop == 400
     assert all(len(window) <= 120 for window in cut)
     assert all(a.stop - b.start == 24 for a, b in itertools.pairwise(cut))
+
+
+@pytest.mark.parametrize("spacing", [1, 4])
+def test_frames_resolved_first_hold_the_ends_of_each_run(spacing: int) -> None:
+    free = np.array([True] * 6 + [False] * 9 + [True] + [False])
+    knots = np.flatnonzero(knots_of(free, spacing)).tolist()
+    assert knots == (list(range(17)) if spacing == 1 else [0, 4, 5, 6, 10, 14, 15, 16])
