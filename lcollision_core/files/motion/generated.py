@@ -1,8 +1,8 @@
 """Read motions of generators: arrays of joint positions, with or without rotations.
 
-Kimodo's .npz files have both. HumanML3D's .npy files of (T, 22, 3) positions or (T, 263) vectors,
-and MDM's results.npy, have no rotations: these are fitted, each joint turning as little as possible
-relative to its parent.
+Kimodo's .npz files have both. HumanML3D's .npy files of (T, 22, 3) positions, of N such motions, or
+of (T, 263) vectors, and MDM's results.npy, have no rotations: these are fitted, each joint turning
+as little as possible relative to its parent.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import io
 import os
 import pickle
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -97,7 +98,7 @@ def holds_joints(path: str | os.PathLike[str]) -> bool:
             shape, _, dtype = read_header(file)
     except (MeshFileError, OSError, ValueError, EOFError):
         return False
-    return dtype.hasobject or shape[1:] in (_JOINTS, _VECTORS)
+    return dtype.hasobject or _JOINTS in (shape[1:], shape[2:]) or shape[1:] == _VECTORS
 
 
 def read_generated(path: str | os.PathLike[str]) -> list[SkeletonMotion]:
@@ -151,8 +152,8 @@ def _filled(places: FloatArray) -> tuple[int, tuple[str, ...]]:
 def _samples(path: Path) -> list[tuple[str, FloatArray, str]]:
     """Return the motions of a .npy file: name, (T, 22, 3) joint positions and description."""
     expected = (
-        "(T, 22, 3), places of the joints of HumanML3D, (T, 263), its vectors, or the dict of "
-        "MDM's results.npy with 'motion'"
+        "(T, 22, 3) or (N, T, 22, 3), places of the joints of HumanML3D, (T, 263), its vectors, or "
+        "the dict of MDM's results.npy with 'motion'"
     )
     with open_regular(path) as file:
         if os.fstat(file.fileno()).st_size > _MOST_BYTES:
@@ -168,16 +169,13 @@ def _samples(path: Path) -> list[tuple[str, FloatArray, str]]:
         if len(lengths) != len(motion) or lengths.dtype.kind not in "iu":
             raise MeshFileError("its 'lengths' are not whole numbers, one for each motion")
         places = np.moveaxis(_usable(motion, "'motion'"), 3, 1)
-        several = len(places) > 1
-        return [
-            (f"{path.stem} {n + 1}" if several else "", sample[: max(int(length), 1)], "of MDM")
-            for n, (sample, length) in enumerate(zip(places, lengths, strict=True))
-        ]
-    if shape[1:] not in (_JOINTS, _VECTORS):
+        cut = [row[: max(int(length), 1)] for row, length in zip(places, lengths, strict=True)]
+        return _numbered(path, cut, "of MDM")
+    if _JOINTS not in (shape[1:], shape[2:]) and shape[1:] != _VECTORS:
         raise MeshFileError(f"it is {shape}, expected {expected}")
     array = _usable(np.load(path, mmap_mode="r", allow_pickle=False), "it")
-    if shape[1:] == _JOINTS:
-        return [("", array, "of HumanML3D")]
+    if shape[1:] != _VECTORS:
+        return _numbered(path, array.reshape(-1, *shape[-3:]), "of HumanML3D")
     places = _joints_of_vectors(array)
     heights = np.ptp(places[..., 1], axis=1)
     if not _LEAST_HEIGHT < float(np.median(heights)) < _MOST_HEIGHT:
@@ -186,6 +184,17 @@ def _samples(path: Path) -> list[tuple[str, FloatArray, str]]:
             "undo the normalisation: multiply by Std.npy and add Mean.npy of HumanML3D",
         )
     return [("", places, "that the vectors of HumanML3D hold")]
+
+
+def _numbered(
+    path: Path, samples: Sequence[FloatArray] | FloatArray, what: str
+) -> list[tuple[str, FloatArray, str]]:
+    """Return the motions of a file with their names, which are empty for a single one."""
+    several = len(samples) > 1
+    return [
+        (f"{path.stem} {number}" if several else "", sample, what)
+        for number, sample in enumerate(samples, 1)
+    ]
 
 
 def _joints_of_vectors(vectors: FloatArray) -> FloatArray:

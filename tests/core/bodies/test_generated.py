@@ -117,7 +117,7 @@ def test_frames_that_only_fill_an_array_are_left_out(tmp_path: Path, kind: str) 
 def test_other_arrays_are_refused_by_what_was_expected(tmp_path: Path) -> None:
     path = tmp_path / "vectors.npy"
     np.save(path, np.zeros((9, 262)))
-    with pytest.raises(MeshFileError, match=r"it is \(9, 262\), expected \(T, 22, 3\), places"):
+    with pytest.raises(MeshFileError, match=r"it is \(9, 262\), expected \(T, 22, 3\) or"):
         read_generated(path)
     assert motion_files(tmp_path) == []
     np.save(path, np.random.default_rng(0).normal(0.0, 1.0, (9, 263)) * 3.0)
@@ -198,6 +198,14 @@ def test_mdm_results_are_motions_of_their_lengths(tmp_path: Path, order: str) ->
     # Sums depend on the array's memory layout.
     np.testing.assert_allclose(first.turns, plain.turns, atol=1e-12)
     assert motion_files(tmp_path) == [tmp_path / "plain.npy", path]
+    # T2M-GPT and others keep the batch.
+    for n in (1, 2):
+        np.save(tmp_path / "batch.npy", np.stack([places.astype(np.float32)] * n))
+        batch = read_generated(tmp_path / "batch.npy")
+        assert [own.name for own in batch] == ([""] if n == 1 else ["batch 1", "batch 2"])
+        for own in batch:
+            np.testing.assert_allclose(own.rotations(), plain.rotations(), atol=1e-12)
+    assert tmp_path / "batch.npy" in motion_files(tmp_path)
 
 
 def test_vectors_of_humanml3d_are_the_joints_that_they_were_made_of(tmp_path: Path) -> None:
