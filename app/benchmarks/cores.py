@@ -4,14 +4,18 @@ The fields of a row:
 
 what : the loop
 items : poses, rows or frames in it
-ms_one, ms_all : milliseconds per item on one thread and on all cores, best of alternating runs
+ms_one, ms_all : milliseconds per item on one thread and on all cores, medians of alternating runs
+    of at least a second
 ratio : of these
 cpu_ratio : processor time on all cores against one thread; above 1, threads wait for memory or spin
+serial : share of the processor time on all cores that the calling thread takes, alone
 switches : voluntary context switches per item on all cores
 """
 
 from __future__ import annotations
 
+import math
+import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +30,8 @@ from lcollision_core.labels import Labeller
 from lcollision_core.labels.labelling_run import label_locally
 from lcollision_core.motion import screen_motion
 
-_ROUNDS = 5
+_ROUNDS, _SECONDS = 5, 1.0
+"""Runs on each number of threads, and least time of a run on all cores."""
 
 Loop = Callable[[int], object]
 """A loop, called with the number of threads."""
@@ -67,14 +72,16 @@ def time_cores(loops: dict[str, tuple[int, Loop]], n_threads: int, job: Job) -> 
     """Time loops alternately on one thread and on several; `job` reports loops."""
     rows = []
     for done, (name, (n_items, loop)) in enumerate(loops.items(), 1):
-        best: dict[int, tuple[float, float, float]] = {}
-        for count in (n_threads, *(1, n_threads) * _ROUNDS):
+        loop(n_threads)  # Compiles.
+        repeats = math.ceil(_SECONDS / _measured(loop, n_threads, 1)[0])
+        runs: dict[int, list[tuple[float, ...]]] = {1: [], n_threads: []}
+        for count in (1, n_threads) * _ROUNDS:
             job.check()
-            waits, cpu, began = _waits(), time.process_time(), time.perf_counter()
-            loop(count)
-            run = time.perf_counter() - began, time.process_time() - cpu, _waits() - waits
-            best[count] = min(best.get(count, run), run)
-        (one, cpu_one, _), (several, cpu_several, switches) = best[1], best[n_threads]
+            runs[count].append(_measured(loop, count, repeats))
+        (one, cpu_one, *_), (several, cpu_several, serial, switches) = (
+            [statistics.median(figures) / repeats for figures in zip(*runs[count], strict=True)]
+            for count in (1, n_threads)
+        )
         rows.append(
             {
                 "what": name,
@@ -83,11 +90,21 @@ def time_cores(loops: dict[str, tuple[int, Loop]], n_threads: int, job: Job) -> 
                 "ms_all": 1e3 * several / n_items,
                 "ratio": one / several,
                 "cpu_ratio": cpu_several / cpu_one,
+                "serial": serial / cpu_several,
                 "switches": switches / n_items,
             }
         )
         job.report(done, len(loops))
     return rows
+
+
+def _measured(loop: Loop, n_threads: int, repeats: int) -> tuple[float, ...]:
+    """Return the seconds, those of the processor and of this thread on it, and the switches."""
+    began = time.perf_counter(), time.process_time(), time.thread_time(), _waits()
+    for _ in range(repeats):
+        loop(n_threads)
+    ended = time.perf_counter(), time.process_time(), time.thread_time(), _waits()
+    return tuple(end - begin for begin, end in zip(began, ended, strict=True))
 
 
 def _waits() -> int:

@@ -226,7 +226,7 @@ def cores(
         Path | None,
         typer.Option(metavar="FILE", readable=False, help="The motion that is screened."),
     ] = None,
-    n_poses: BatchOption = 256,
+    n_poses: BatchOption = 1024,
     workers: ThreadsOption = None,
     as_json: JsonOption = False,
 ) -> None:

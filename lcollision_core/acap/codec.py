@@ -380,7 +380,8 @@ def fit_rings(
     owner = np.repeat(np.arange(topology.n_vertices), n_neighbours)
     spoke = rest_vertices[owner] - rest_vertices[ring]
     normals = np.empty_like(rest_vertices)
-    scaled_normals(rest_vertices, topology.faces, start, ring, normals)
+    # A copy, as it would be compiled once more for an array that is read-only.
+    scaled_normals(rest_vertices.copy(), topology.faces, start, ring, normals)
     mean_weight = np.bincount(owner, weight, topology.n_vertices) / np.maximum(n_neighbours, 1)
     row_weight = normal_weight * mean_weight
 

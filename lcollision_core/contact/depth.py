@@ -137,7 +137,8 @@ def _fill_depth_slopes(corners: FloatArray, depths: FloatArray, slopes: FloatArr
 @compiled_part
 def _depth_slope(corners, slope):
     """Return the least overlap of (2, 3, 3) triangles near the origin; fill its (2, 3, 3) slope."""
-    best, direction, upper, high, low = np.inf, 0, 0, 0, 0
+    # With a plain 0, what spans a direction would be compiled twice.
+    best, direction, upper, high, low = np.inf, int(np.int64(0)), 0, 0, 0
     for n in range(11):
         first, second, across, length_squared = _spanned(corners, n)
         spanned = _dot(first, first) * _dot(second, second)

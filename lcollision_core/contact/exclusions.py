@@ -205,6 +205,8 @@ def rules_of(
     penetration_depth : (n,) normalised
     """
     rule = np.empty(len(pairs), dtype=np.uint8)
+    # Faces as the search has them, or the rules would be compiled once more.
+    pairs = np.ascontiguousarray(pairs, dtype=np.int32)
     find_rules(pairs, np.asarray(penetration_depth, dtype=np.float64) ** 2, exclusions, rule)
     return rule
 

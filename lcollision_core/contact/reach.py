@@ -198,8 +198,10 @@ def _reached(
     creases: Creases | None = None,
 ) -> Lists:
     """List for each of n vertices those within a distance, or the later ones among them."""
-    none = np.zeros((0, 3))
-    bounds = creases or Creases(none, np.zeros(0), none, np.zeros(0))
+    nowhere = np.zeros((0, 3))
+    # As a body's reference is, or the search would be compiled once more.
+    nowhere.flags.writeable = False
+    bounds = creases or Creases(nowhere, np.zeros(0), np.zeros((0, 3)), np.zeros(0))
     n_vertices = len(surface.edge_start) - 1
 
     def search(first: int, last: int) -> tuple[LongArray, IntArray]:

@@ -144,10 +144,11 @@ class FeatureDecoder:
         by_codes = np.zeros((len(scaled), len(codes)))
         tables = self._tables
         for number, group in enumerate(self.groups):
-            group_codes = slice(*tables.first_code[number : number + 2])
+            first, stop = tables.first_code[number : number + 2]
             blocks = tables.numbers[slice(*tables.first_number[number : number + 2])]
             blocks = blocks.reshape(-1, len(group.weights), _BLOCK)
-            _pull_group(codes[group_codes], blocks, group.support, scaled, by_codes[:, group_codes])
+            # Columns of one row would be another type of array, and compiled once more.
+            _pull_group(codes[first:stop], blocks, group.support, scaled, by_codes, first)
         return by_codes
 
     def _checked(self, latent: npt.NDArray[Any]) -> Float32Array:
@@ -238,6 +239,7 @@ def _pull_group(
     support: npt.NDArray[np.int32],
     by_output: npt.NDArray[np.float32],
     by_codes: FloatArray,
+    first_code: int,
 ) -> None:
     """Add the derivative by one group's codes, given that by its scaled output.
 
@@ -247,7 +249,7 @@ def _pull_group(
     blocks : (n_blocks, m, `_BLOCK`) of `_Tables`
     support : of a `DecoderGroup`
     by_output : (n, V, 9) float32 array
-    by_codes : (n, m) float64 array, added to
+    by_codes : (n, D) float64 array, added to from column `first_code`
     """
     width = blocks.shape[2]
     slope = np.empty(width, dtype=np.float32)
@@ -273,7 +275,7 @@ def _pull_group(
                 total = np.float32(0.0)
                 for i in range(9 * n_here):
                     total += weighted[i] * weights[i]
-                by_codes[row, k] += total
+                by_codes[row, first_code + k] += total
 
 
 CENTRED_SCALE = 0.5

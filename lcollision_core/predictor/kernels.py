@@ -362,8 +362,10 @@ def _gather(
         # Without a branch, which would be mispredicted.
         near[n_near] = BLOCK * k
         n_near += (x * x + y * y + z * z) * outer < one
+    # Copying would be compiled once more for plain numbers.
+    start, times = int(np.int64(0)), int(np.int64(1))
     for c in range(6):
-        _copy_blocks(ordered[c], 0, 1, near, BLOCK * n_near, gathered[c])
+        _copy_blocks(ordered[c], start, times, near, BLOCK * n_near, gathered[c])
     return BLOCK * n_near
 
 
