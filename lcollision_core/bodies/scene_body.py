@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain, zip_longest
+from itertools import chain, product, zip_longest
 from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
@@ -42,6 +42,9 @@ from lcollision_core.resolve import BodyAlone, PoseResolver
 
 _GAP = 0.01
 """Normalised gap between bodies in poses that are assumed to be free."""
+
+_SHIFTS = (0.01, 0.02, 0.04, 0.08, 0.16)
+"""Normalised lengths by which bodies are shifted apart, until they are free."""
 
 _GREY = "#808080"
 
@@ -626,6 +629,17 @@ class SceneBody(Body):
         away = np.linalg.norm(vertices - self._space.decode(latent[None])[0], axis=1)
         return LatentFit(latent, np.eye(3), np.zeros(3), float(away.mean()), float(away.max()))
 
+    @property
+    def _movable(self) -> npt.NDArray[np.bool_]:
+        """Whether each of the bodies that nothing holds can be shifted as a whole."""
+        members = zip(self.standing, self._space.members, strict=True)
+        return np.array(
+            [
+                member.moves and not member.is_fixed and placed.has_place
+                for member, placed in members
+            ]
+        )
+
     def separated_poses(self, latent: FloatArray) -> list[FloatArray]:
         """Return variants of a (D,) pose with the bodies moved apart and out of the ground.
 
@@ -634,11 +648,8 @@ class SceneBody(Body):
         up = np.eye(3)[self.up_axis]
         decoded = self._space.decode(latent[None])[0]
         meshes = [decoded[own] for own in self._space.vertices]
-        movable = [
-            member.moves and not member.is_fixed and placed.has_place
-            for member, placed in zip(self.standing, self._space.members, strict=True)
-        ]
-        if not any(movable):
+        movable = self._movable
+        if not movable.any():
             return []
         ground = [
             float((mesh @ up).max())
@@ -662,10 +673,35 @@ class SceneBody(Body):
             ways.insert(0, line / length)
         poses = []
         for way in ways:
-            shifts = _row([mesh @ way for mesh in meshes], movable, bodies)
+            shifts = _row([mesh @ way for mesh in meshes], movable.tolist(), bodies)
             moves = [shift * way + lift * up for shift, lift in zip(shifts, lifts, strict=True)]
             poses.append(self._space.moved_apart(latent, moves))
         return poses
+
+    def least_separated(self, latent: FloatArray, check: ExactCheck) -> FloatArray:
+        """Return (n, D) free variants of a (D,) pose with whole bodies shifted by the least length.
+
+        A single movable body is shifted along the axes and diagonals, several away from their
+        middle. There may be none.
+        """
+        decoded, movable = self._space.decode(latent[None])[0], self._movable
+        middles = np.array([decoded[own].mean(axis=0) for own in self._space.vertices])
+        signs = np.array([sign for sign in product((-1, 0, 1), repeat=3) if any(sign)])
+        ways = signs / np.linalg.norm(signs, axis=1)[:, None]
+        shares = np.tile(movable.astype(np.float64), (len(ways), 1))
+        if movable.sum() > 1:
+            shares *= 0.5 * np.sign(ways @ (middles - middles[movable].mean(axis=0)).T)
+        for length in _SHIFTS if movable.any() else ():
+            poses = np.array(
+                [
+                    self._space.moved_apart(latent, list(length * share[:, None] * way))
+                    for share, way in zip(shares, ways, strict=True)
+                ]
+            )
+            is_free = check.are_free(poses)
+            if is_free.any():
+                return poses[is_free]
+        return np.empty((0, self.latent_size))
 
     @cached_property
     def free_latent(self) -> FloatArray:
@@ -714,7 +750,9 @@ class SceneBody(Body):
         return alone
 
     def starting_poses(self, target: FloatArray, check: ExactCheck) -> FloatArray:
-        """Return poses near a (D,) target with resolved bodies apart; they may still collide.
+        """Return poses near a (D,) target with resolved bodies apart.
+
+        If no small shift of whole bodies frees them, they are far apart and may still collide.
 
         Parameters
         ----------
@@ -729,7 +767,12 @@ class SceneBody(Body):
         for body in self._alone.values():
             found = body.resolver.resolve(target[body.codes], body.options(options))
             latent[body.codes] = found.latent
-        return np.array(self.separated_poses(latent)).reshape(-1, self.latent_size)
+        near = self.least_separated(latent, check)
+        return (
+            near
+            if len(near)
+            else np.array(self.separated_poses(latent)).reshape(-1, self.latent_size)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -781,9 +824,6 @@ class SceneResolver(PoseResolver):
     starts : maps a target and the check to further starting poses
     bodies : those that can be resolved separately
     """
-
-    # Poses with the bodies apart are far from the target, and slow to find and to leave.
-    _pushes_first = True
 
     def __init__(
         self,

@@ -225,7 +225,7 @@ class CollisionDetector:
         self._nearness: ClearanceRule | None = None
         self._last_nearness: tuple[tuple[float, bool], ClearanceRule] | None = None
         self._may_touch: TouchingGroups = ()
-        self._path: LinearPath | None = None
+        self._paths: list[LinearPath] = []  # at most one, shared with copies
 
     @property
     def may_touch(self) -> TouchingGroups:
@@ -619,13 +619,13 @@ class CollisionDetector:
         ]
         if not np.isfinite(poses[1][self.topology.faces]).all():
             raise ShapeError("a vertex is not finite", where="the end pose of the path")
-        if self._path is None:
-            self._path = LinearPath(self.topology, self.reference / self.body_size)
+        if not self._paths:
+            self._paths.append(LinearPath(self.topology, self.reference / self.body_size))
         moves = (poses[1] - poses[0])[self.topology.used_vertices]
         # A shift of the whole mesh brings no points nearer, but would make many boxes overlap.
         poses[1] = poses[1] - moves.mean(axis=0)
         length = float(np.percentile(np.linalg.norm(moves - moves.mean(axis=0), axis=1), 90))
-        edge = self._path.edge * self.body_size / unit
+        edge = self._paths[0].edge * self.body_size / unit
         step = max(_EDGES_A_STEP * edge, length / _MOST_STEPS)
         n = math.ceil(length / step) if length > 0.0 else 1
         between = [poses[0] + (poses[1] - poses[0]) * (at / n) for at in range(1, n)]
@@ -642,8 +642,7 @@ class CollisionDetector:
                 parts.append(self._tree.slot_face[searcher.found.slots[:n_found][counts]])
         middle = start[self.topology.faces].mean(axis=(0, 1))
         first, last = ((pose - middle) * (unit / self.body_size) for pose in (start, end))
-        assert self._path is not None
-        return self._path.touches(np.concatenate(parts), first, last)
+        return self._paths[0].touches(np.concatenate(parts), first, last)
 
     def _exclusions_of(
         self, reference: FloatArray, rules: ContactRules, groups: Sequence[FaceGroup]

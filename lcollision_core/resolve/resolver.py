@@ -151,7 +151,6 @@ class Ladder:
     known_free : computes `free_latents`, (F, D) float64 array of poses known to be free
     correction : (D,) float64 array to try first, or None
     job : reports (steps done, all steps); the last step is pulling back
-    pushes_first : whether steps out of contact come before those from known free poses
     remark : note on the request, whatever the result, or None
     standing : the parts that should stay on the ground, or None
     """
@@ -162,7 +161,6 @@ class Ladder:
     known_free: Callable[[], FloatArray]
     correction: FloatArray | None
     job: Job
-    pushes_first: bool = False
     remark: str | None = None
     standing: Standing | None = None
 
@@ -171,7 +169,6 @@ class Ladder:
         self._outcome = SolverOutcome(self.problem.target, "not run", False, False, 0)
         self._nearer: FloatArray | None = None
         self._candidates: deque[FloatArray] = deque(maxlen=_REMEMBERED)
-        self._has_pushed = False
 
     @cached_property
     def free_latents(self) -> FloatArray:
@@ -182,16 +179,6 @@ class Ladder:
     def _least(self) -> LeastOverlap:
         assert self.options.largest_change is not None
         return LeastOverlap(self.check, self.problem, self.options.largest_change)
-
-    def _push_out(self, known: FloatArray | None = None) -> FloatArray | None:
-        """Return the pose reached by steps out of contact if it is nearer than a known one.
-
-        This runs at most once, and only without a predictor.
-        """
-        if self._has_pushed or self.problem.model is not None or not self.options.largest_change:
-            return None
-        self._has_pushed = True
-        return self._least.push_out(self._put_back, known)
 
     def climb(self) -> ResolveResult:
         """Try the steps until one resolves the collisions, then pull back."""
@@ -209,9 +196,7 @@ class Ladder:
             for done, (tried, better) in enumerate(self._steps(), 1):
                 self.job.report(done, self._n_steps)
                 if better is not None:
-                    latent, step = better, tried
-                    if step != Step.PUSH_OUT:
-                        latent = self._put_back(pull_back(check, problem, better))
+                    latent, step = self._put_back(pull_back(check, problem, better)), tried
                     break
             else:
                 note = self._why_not()
@@ -245,8 +230,10 @@ class Ladder:
         note. If no free pose was found at any distance, its note stays.
         """
         least = self._least
-        if found is None or least.mean_change(found) > _FAR:
-            pushed = self._push_out(found if found is not None and least.is_within(found) else None)
+        is_far = found is None or least.mean_change(found) > _FAR
+        if is_far and self.problem.model is None:
+            known = found if found is not None and least.is_within(found) else None
+            pushed = least.push_out(self._put_back, known)
             if pushed is not None:
                 found, step = pushed, Step.PUSH_OUT
         if found is not None and least.is_within(found):
@@ -283,7 +270,7 @@ class Ladder:
     def _n_steps(self) -> int:
         """Return the most steps that `_steps` yields, plus pulling back."""
         if self.problem.model is None:
-            n_tries = 1 + self.pushes_first
+            n_tries = 1
         elif self.options.solver == Solver.SQP:
             n_tries = len(ITERATIONS) + 1
         else:
@@ -297,8 +284,7 @@ class Ladder:
             near = np.clip(problem.target + self.correction, problem.low, problem.high)
             yield Step.NEIGHBOUR, self._first_free([near])
         if problem.model is None:
-            pushed = self._by_push_out() if self.pushes_first else ()
-            tries = chain(self._by_polish(), pushed, self._from_free_poses())
+            tries = chain(self._by_polish(), self._from_free_poses())
         else:
             tries = chain(self._by_margins(), self._by_polish(), self._by_restarts())
         while not problem.deadline.expired and (tried := next(tries, None)) is not None:
@@ -345,9 +331,6 @@ class Ladder:
             return
         for start in starts:
             yield Step.RESTART, self._first_free([self._solve(margin, start).latent])
-
-    def _by_push_out(self) -> Iterator[_Tried]:
-        yield Step.PUSH_OUT, self._push_out()
 
     def _from_free_poses(self) -> Iterator[_Tried]:
         yield Step.TOWARDS, step_towards(self.check, self.problem, self.free_latents)
@@ -504,7 +487,6 @@ class PoseResolver:
     """
 
     bodies: tuple[BodyAlone, ...] = ()
-    _pushes_first = False
 
     def __init__(
         self,
@@ -596,7 +578,6 @@ class PoseResolver:
             known_free,
             None if near is None else self._checked(near),
             job,
-            self._pushes_first,
             remark if outside else None,
             standing,
         )

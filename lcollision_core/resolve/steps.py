@@ -227,7 +227,7 @@ class LeastOverlap:
     def __init__(self, check: ExactCheck, problem: ResolveProblem, largest_change: float) -> None:
         self._check, self._problem = check, problem
         self._most = self._bound = largest_change
-        self._start = self._look(problem.target)
+        self._start = self._shallowest = self._look(problem.target)
 
     def is_within(self, latent: FloatArray) -> bool:
         """Whether a (D,) pose moves no vertex farther than the bound."""
@@ -256,7 +256,8 @@ class LeastOverlap:
             self._bound = share * self._most
             ways = [self._look(*self._within(end)) for end in ends[:_WAYS]]
             starts = {
-                id(seen): seen for seen in (self._start, best, *sorted(ways, key=_energy)[:1])
+                id(seen): seen
+                for seen in (self._start, self._shallowest, best, *sorted(ways, key=_energy)[:1])
             }
             ends_of = [*map(self._descend, starts.values()), best]
             better = (end for end in ends_of if not end.found.exceeds(self._start.found))
@@ -333,6 +334,7 @@ class LeastOverlap:
             here = self._look(*self._within(there))
             if _energy(here) < _energy(best):
                 best = here
+        self._shallowest = min(self._shallowest, best, key=_energy)
         free = polish(check, problem, best.latent) if best.found.colliding else best.latent
         if free is None:
             return None

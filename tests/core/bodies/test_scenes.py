@@ -23,7 +23,8 @@ from lcollision_core.files import write_mesh
 from lcollision_core.options import ExportRequest, ResolveOptions
 from lcollision_core.posing import DragOptions, Grip
 from lcollision_core.tasks.exporting import write_members
-from tests.rigged_shapes import rigged_body, write_gltf
+from tests.independent_check import crossing_pairs
+from tests.rigged_shapes import FloatArray, rigged_body, write_gltf
 from tests.small_models import DATA
 
 _BOX = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
@@ -133,6 +134,55 @@ def test_a_fixed_body_does_not_give_way(folder: Path) -> None:
     assert result.exactly_free
     assert not body.codes_of_member("villain", result.latent).any()
     assert body.codes_of_member("hero", result.latent).any()
+
+
+def crossed_by(prop: str, body: SceneBody, vertices: FloatArray) -> set[str]:
+    """Return the parts that a prop crosses, by the independent check."""
+    pairs = np.array(sorted(crossing_pairs(vertices, body.faces)), np.int64).reshape(-1, 2)
+    names = np.array(body.domain_names)[body.space.vertex_domain[body.faces[pairs][:, :, 0]]]
+    return {str(name) for row in names.tolist() if prop in row for name in row} - {prop}
+
+
+def test_whole_bodies_are_shifted_apart_as_little_as_it_takes(
+    two: SceneBody, tmp_path: Path, folder: Path
+) -> None:
+    # The legs stand 24 cm deep in a step.
+    size = np.array([0.8, 0.3, 0.8])
+    write_mesh(tmp_path / "step.obj", (_BOX - [0.5, 0.0, 0.5]) * size - [0, 0.05, 0], _BOX_FACES)
+    step = ScenePart(str(tmp_path / "step.obj"), fixed=True)
+    body = body_of_scene(SceneFile((ScenePart(str(folder / "hero.glb")), step)))
+    assert crossed_by("step", body, body.reference) >= {"Left shin", "Right shin"}
+    hero = body.vertices_of["hero"]
+    poses = body.decode(body.least_separated(np.zeros(body.latent_size), body.exact_check()))
+    assert len(poses)
+    for pose in poses:
+        assert not crossed_by("step", body, pose)
+        moved = pose[hero] - body.reference[hero]
+        assert np.allclose(moved, moved[0])
+        assert 0.24 < np.linalg.norm(moved[0]) < 2.0 * 0.24
+    (pose, *_) = two.decode(two.least_separated(np.zeros(two.latent_size), two.exact_check()))
+    ways = [
+        (pose - two.reference)[two.vertices_of[name]].mean(axis=0) for name in ("hero", "villain")
+    ]
+    assert np.allclose(*np.abs(ways))
+    assert ways[0][0] < 0.0 < ways[1][0]
+
+
+def test_what_a_held_prop_cannot_leave_does_not_keep_it_in_the_rest(
+    tmp_path: Path, folder: Path
+) -> None:
+    # The grip crosses the forearm in every pose, and the blade the trunk at first.
+    grip = (_BOX - [0.0, 0.5, 0.5]) * [0.2, 0.1, 0.02] + [0.66, 1.45, 0.0]
+    blade = (_BOX - [0.0, 0.5, 0.5]) * [1.0, 0.02, 0.02] + [-0.05, 1.2, 0.0]
+    faces = np.concatenate([_BOX_FACES, _BOX_FACES + len(_BOX)])
+    write_mesh(tmp_path / "sword.obj", np.concatenate([grip, blade]), faces)
+    sword = ScenePart(str(tmp_path / "sword.obj"), held_by="hero", joint="LeftHand")
+    body = body_of_scene(SceneFile((ScenePart(str(folder / "hero.glb")), sword)))
+    result = body.resolve(np.zeros(body.latent_size))
+    assert crossed_by("sword", body, body.reference) == {"Torso", "Left forearm", "Left hand"}
+    assert crossed_by("sword", body, result.vertices) == {"Left forearm", "Left hand"}
+    assert not result.exactly_free
+    assert result.note == "no pose without collisions was found"
 
 
 def test_the_only_body_that_is_posed_keeps_its_names_and_its_mirror(folder: Path) -> None:
