@@ -55,6 +55,7 @@ from lcollision_core.files.scene_files import open_rigged, read_scene
 from lcollision_core.files.table import (
     ANIMATED_SUFFIXES,
     BVH_SUFFIX,
+    MOTION_SUFFIXES,
     SCENE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
@@ -289,6 +290,9 @@ def read_motions(
     if suffix == ".json":
         return [_of_poses(body, path, fps or NOMINAL_RATE)]
     if suffix not in SCENE_SUFFIXES:
+        if path.is_file() and suffix not in MOTION_SUFFIXES:
+            one_of = f"use one of {', '.join((*MOTION_SUFFIXES, '.npy', '.json'))}"
+            raise MeshFileError("is not a motion file", one_of, where=path)
         poses = read_pose_set(path, job.part(), topology=body.topology)
         body.require_topology(poses.topology, str(path))
         # A point cache's frames follow the rest pose.

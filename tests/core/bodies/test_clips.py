@@ -221,6 +221,9 @@ def test_a_clip_is_checked_and_resolved_into_the_characters_own_file(
     choice = MotionChoice(clip=CLIP)
     with pytest.raises(MeshFileError, match="an animation, but no mesh; name or open the char"):
         check_clips(path, CheckRequest())
+    (tmp_path / "moves.usd").write_text("#usda 1.0")
+    with pytest.raises(MeshFileError, match=r"is not a motion file; use one of .*\.bvh"):
+        read_motions(body, tmp_path / "moves.usd")
     (verdict,) = check_clips(path, CheckRequest(body=str(hero), motion=choice))
     assert verdict.colliding
     assert verdict.frames == N_FRAMES
