@@ -944,9 +944,9 @@ class CollisionPanel(QWidget):
         page.setLayout(vbox(self.proposal, self.prediction, self.outcome, None, margins=margins))
         self._area = scrolling(page)
         # In a low window it shrinks in favour of the cards that are always visible.
-        self._area.setMinimumHeight(ROW_HEIGHT // 2)
+        self._area.setMinimumHeight(ROW_HEIGHT - TIGHT)
         headline = vbox(self.exact, margins=(CLOSE, TIGHT, CLOSE, 0))
-        remedy = vbox(self.resolve, margins=(CLOSE, 0, CLOSE, CLOSE))
+        remedy = vbox(self.resolve, margins=(CLOSE, 0, CLOSE, TIGHT))
         self.setLayout(vbox(headline, self._area, remedy))
         document.history.outcome_changed.connect(self._on_outcome)
 

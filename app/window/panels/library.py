@@ -266,7 +266,7 @@ class LibraryPanel(QWidget):
         side = held(vbox(*rows[:3], None, target, self.blend, spacing=TIGHT))
         side.setFixedWidth(182)
         poses = hbox(side, self.list, wide=self.list, spacing=NORMAL)
-        page = vbox(bar, poses, margins=(NORMAL, TIGHT, NORMAL, CLOSE))
+        page = vbox(bar, poses, margins=(NORMAL, TIGHT, NORMAL, TIGHT))
         page.setStretchFactor(poses, 1)
         self.setLayout(page)
         order = (*self._sources.buttons(), self.search, self.tags, self.list, *rows)
