@@ -204,7 +204,7 @@ def test_mdm_results_are_motions_of_their_lengths(tmp_path: Path, order: str) ->
         batch = read_generated(tmp_path / "batch.npy")
         assert [own.name for own in batch] == ([""] if n == 1 else ["batch 1", "batch 2"])
         for own in batch:
-            np.testing.assert_allclose(own.rotations(), plain.rotations(), atol=1e-12)
+            np.testing.assert_allclose(own.turns, plain.turns, atol=1e-12)
     assert tmp_path / "batch.npy" in motion_files(tmp_path)
 
 
