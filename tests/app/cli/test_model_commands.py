@@ -307,16 +307,16 @@ def test_a_model_renamed_while_another_is_trained_to_its_file_stays(
     tube: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from lcollision_core.embedding import training
+    from lcollision_core.tasks import learning
 
-    train = training.train_embedding
+    train = learning.train_embedding
 
     def rename_then_train(poses: PoseSet, config: EmbeddingConfig, **options: Any) -> Any:
         change_model(tube, lambda model: model.edit_domains({0: "neck"}))
         quick = replace(config, level1_epochs=10, level2_epochs=5, held_out_stride=0)
         return train(poses, quick, **options)
 
-    monkeypatch.setattr(training, "train_embedding", rename_then_train)
+    monkeypatch.setattr(learning, "train_embedding", rename_then_train)
     result = lcollision("train", "embedding", dataset, "-o", tube, "--domains", 1, "--seed", 2)
     assert result.exit_code == 0, result.output
     beside = tube.with_name("tube 2.safetensors")

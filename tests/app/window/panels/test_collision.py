@@ -290,7 +290,7 @@ def test_a_result_says_of_what_the_body_has_moved_its_shares(
     rest(qtbot, window)
     resolve(qtbot, window)
     (moved,) = (text for text in texts(window.collision.outcome) if "at most" in text)
-    assert re.fullmatch(r"[\d.]+ % of the body size,\nat most [\d.]+ %", moved)
+    assert re.fullmatch(r"[\d.]+\xa0% of the body size, at most [\d.]+\xa0%", moved)
     window.resizeDocks([window.docks["collision"]], [1], Qt.Orientation.Horizontal)
     settle_layout(qtbot, window)
     assert has_room(window)
