@@ -392,9 +392,9 @@ def worse(path):
             joints, turns = [*joints, right], np.concatenate([turns, up[None]])
         return turn(self, transforms, joints, turns, by_fk)
 
-    def read_more_pairs(*arguments):
+    def read_more_pairs(*arguments, **options):
         """Report one more pair than before for a freed frame."""
-        frames = yield from read(*arguments)
+        frames = yield from read(*arguments, **options)
         for at, number in enumerate(frames.numbers):
             if number == 8 and frames.found[at]["colliding"]:
                 first.update(frames.found[at])
