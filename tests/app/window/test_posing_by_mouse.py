@@ -67,8 +67,8 @@ ACROSS = 0.1
 CROSSED: tuple[tuple[bool, Point], ...] = (
     (True, (0.13, -0.22, 1.18)),
     (False, (-0.13, -0.22, 1.12)),
-    (True, (0.26, -0.20, 1.18)),
-    (False, (-0.26, -0.20, 1.14)),
+    (True, (0.26, -0.20, 1.20)),
+    (False, (-0.28, -0.20, 1.12)),
 )
 """Drags from the front that cross the arms: whether the right hand, and its target."""
 
