@@ -526,7 +526,8 @@ class _Resolution:
         near = before[1] if before is not None and not was_free[0] else None
         freed = self.freed[span] = {}
         fractions = [_fractions(self.substeps[at]) for at in self._own(window)]
-        # If few frames first do not free all, resolve each of them first.
+        solutions: list[tuple[tuple[int, int, float], FloatArray, npt.NDArray[np.bool_]]] = []
+        # If few frames first do not free all, or not smoothly, resolve each of them first.
         for knots in (knots_of(was_free, motion.in_frames(_SPACING)), np.ones_like(was_free)):
             start, known = np.zeros((len(window), motion.codes.shape[1])), was_free.copy()
             colliding = [[window.start + at for at in run if knots[at]] for run in runs(~known)]
@@ -550,8 +551,11 @@ class _Resolution:
             except CancelledError:
                 freed |= {window.start + at: moved for at, moved in program.so_far().items()}
                 raise
-            if program.is_settled or knots.all():
+            worth = int((~free).sum()), program.n_apart, program.cost(solution)
+            solutions.append((worth, solution, free))
+            if knots.all() or (program.is_settled and not program.is_jerky(solution)):
                 break
+        _, solution, free = min(solutions, key=lambda tried: tried[0])
         targets = motion.codes[window.start : window.stop]
         return list(zip(_added(targets, solution), free.tolist(), strict=True))
 

@@ -260,6 +260,11 @@ again."""
 _FALLING = 0.4
 """Share of the cost below which a search is followed by another one in any case."""
 
+_MOSTLY_BENT, _BENT_MORE = 0.5, 1.2
+"""Corrections are jerky if their bends count for more than this share of their size, and the motion
+bends by more than this factor; 0.15 to 0.41 and at most 1.0 were seen, and 0.72 and 4.7 of those of
+a search that had met contacts on the wrong sides."""
+
 _STILL = 1e-4
 """Normalised distance from a pose that was free within which a frame is taken as free, until all
 others are."""
@@ -370,7 +375,7 @@ class SpanProgram:
             # What is between the knots moves with them.
             self._watched = np.ones_like(self.knots)
             if self._rounds < _PINNED_AT[1]:
-                least = self._cost(best.corrections)
+                least = self.cost(best.corrections)
             best = self._search(best)
         best = self._best = self._settled_search(best, _ENOUGH * least)
         put_back: npt.NDArray[np.bool_] = ~best.is_free & self._is_known
@@ -384,7 +389,7 @@ class SpanProgram:
             # Search again without the touches that stay apart.
             best = self._search(None)
         for _ in range(1, _SEARCHES):
-            self._best, cost = best, self._cost(best.corrections)
+            self._best, cost = best, self.cost(best.corrections)
             is_done = best.score > 0.0 or _FALLING * last <= cost <= enough
             if self._is_settled(best) and is_done:
                 break
@@ -406,6 +411,11 @@ class SpanProgram:
     def is_settled(self) -> bool:
         """Whether a search has freed all but the frames for which no free pose was found."""
         return self._best is not None and self._is_settled(self._best)
+
+    @property
+    def n_apart(self) -> int:
+        """Number of patches, summed over frames, that should touch and do not."""
+        return self._best.n_apart if self._best is not None else 0
 
     def so_far(self) -> dict[int, FloatArray]:
         """Return the (D,) corrections that free frames, if the search is stopped."""
@@ -520,16 +530,30 @@ class SpanProgram:
         return stuck
 
     def _worth(self, solution: _Evaluation) -> tuple[float, int, float]:
-        return *solution.rank, self._cost(solution.corrections)
+        return *solution.rank, self.cost(solution.corrections)
 
-    def _cost(self, corrections: FloatArray) -> float:
-        """Return the objective of the program."""
+    def cost(self, corrections: FloatArray) -> float:
+        """Return the objective of the program for (n, D) corrections."""
+        return sum(self._parts(corrections))
+
+    def is_jerky(self, corrections: FloatArray) -> bool:
+        """Whether (n, D) corrections make the motion bend more, and are mostly bends."""
+        moved, bent = self._parts(corrections)
+        before, after = (
+            self._square(np.diff(poses, 2, axis=0))
+            for poses in (self._targets, self._targets + corrections)
+        )
+        return bent > _MOSTLY_BENT * moved and after > _BENT_MORE * before
+
+    def _parts(self, corrections: FloatArray) -> tuple[float, float]:
+        """Return what the objective counts of the corrections and of their bends."""
         rows = np.concatenate([corrections, corrections[:2]]) if self.is_cycle else corrections
         known = [side for side in (self.before, rows, self.after) if side is not None]
         bends = np.diff(np.concatenate(known), 2, axis=0)
-        parts = ((1.0, corrections), (self.smoothness, bends))
-        metric = self.frames.metric
-        return sum(w * float(np.einsum("td,de,te->", c, metric, c)) for w, c in parts)
+        return self._square(corrections), self.smoothness * self._square(bends)
+
+    def _square(self, rows: FloatArray) -> float:
+        return float(np.einsum("td,de,te->", rows, self.frames.metric, rows))
 
     def _kernel(self, pinned: dict[int, FloatArray]) -> TimeKernel:
         n, size = self._targets.shape
