@@ -152,6 +152,7 @@ class Shapes:
     ----------
     names : S unique names of the sliders
     low, high : (S,) float64 arrays, the ends of their ranges; 0 is the rest pose
+    at_rest : (S,) float64 array, the weights at rest of those that are morph targets, 0 of others
     mixes : for each part of the scene, the (S, M) weights that each slider adds
     sources : (S, 2) int64 array, the part and morph target whose weight a slider is; -1 for sliders
         that mix several targets, as expressions do
@@ -161,15 +162,10 @@ class Shapes:
     names: tuple[str, ...]
     low: FloatArray
     high: FloatArray
+    at_rest: FloatArray
     mixes: tuple[FloatArray, ...]
     sources: npt.NDArray[np.int64]
     deltas: csc_matrix
-
-    @property
-    def at_rest(self) -> FloatArray:
-        """(S,) weights at rest of single morph targets, from which 0 to 1 is a slider's range."""
-        weights = np.where(self.high > 1.0, 1.0 - self.high, -self.low)
-        return np.where(self.sources[:, 0] >= 0, weights, 0.0)
 
     @cached_property
     def by_row(self) -> csr_matrix:

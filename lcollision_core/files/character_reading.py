@@ -438,7 +438,7 @@ def _shapes(scene: Scene, mesh: JoinedMesh, weights: FloatArray) -> Shapes | Non
     deltas = csc_matrix((*parts, ends), shape=(3 * int(weighing.sum()), len(shape_numbers)))
     names = tuple(names[number] for number in shape_numbers)
     mixes, sources = [], np.full((len(names), 2), -1)
-    low, high = np.zeros(len(names)), np.ones(len(names))
+    weights = np.zeros(len(names))
     for number, (part, at_rest) in enumerate(zip(scene.parts, scene.rest.weights, strict=True)):
         mix = np.array([part.sliders.get(name, np.zeros(len(part.morphs))) for name in names])
         mixes.append(mix)
@@ -449,9 +449,10 @@ def _shapes(scene: Scene, mesh: JoinedMesh, weights: FloatArray) -> Shapes | Non
             # expression.
             sources[(sources == [number, target]).all(axis=1)] = -1
             sources[slider] = number, target
-            low[slider], high[slider] = np.array([0.0, 1.0]) - at_rest[0, target]
-    low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
-    return Shapes(names, low, high, tuple(mixes), sources, deltas)
+            weights[slider] = at_rest[0, target]
+    low, high = np.minimum(0.0 - weights, 0.0), np.maximum(1.0 - weights, 0.0)
+    weights = np.where(sources[:, 0] >= 0, weights, 0.0)
+    return Shapes(names, low, high, weights, tuple(mixes), sources, deltas)
 
 
 def _points(

@@ -139,7 +139,7 @@ def _moved_by_a_shape(is_moved: npt.NDArray[np.bool_], move: Sequence[float]) ->
     deltas = np.repeat(np.where(is_moved[:, None], move, 0.0), used.sum(axis=1), axis=0)
     nothing = np.full((1, 2), -1)
     offsets = csc_matrix(deltas.reshape(-1, 1))
-    shapes = Shapes(("moved",), np.zeros(1), np.ones(1), (), nothing, offsets)
+    shapes = Shapes(("moved",), np.zeros(1), np.ones(1), np.zeros(1), (), nothing, offsets)
     return RigBody.of(replace(character, rig=replace(character.rig, shapes=shapes)))
 
 
@@ -169,7 +169,7 @@ def test_mirroring_exchanges_shapes_by_their_names() -> None:
     assert character.rig is not None
     still = csc_matrix((3 * int((character.rig.weights > 0.0).sum()), len(_NAMES)))
     alone = np.full((len(_NAMES), 2), -1)
-    shapes = Shapes(_NAMES, np.zeros(3), np.ones(3), (), alone, still)
+    shapes = Shapes(_NAMES, np.zeros(3), np.ones(3), np.zeros(3), (), alone, still)
     body = RigBody.of(replace(character, rig=replace(character.rig, shapes=shapes)))
     codes = np.append(0.1 * body.sample(1, np.random.default_rng(0))[0, :-3], [0.5, 0.0, 0.25])
     mirrored = body.pose_mirror.mirror(codes).latent
