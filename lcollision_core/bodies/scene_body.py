@@ -580,12 +580,13 @@ class SceneBody(Body):
         """The groups, names, colours and ranges of the codes."""
         at_rest, shown = np.zeros(self.latent_size), np.ones(self.latent_size)
         units = [""] * self.latent_size
-        for place, _, code in self._by_code(lambda body: body.latent_space.at_rest.tolist()):
-            at_rest[place] = code
-        for place, _, factor in self._by_code(lambda body: body.latent_space.shown.tolist()):
-            shown[place] = factor
-        for place, _, unit in self._by_code(lambda body: body.latent_space.units):
-            units[place] = unit
+
+        def displays(body: Body) -> list[tuple[float, float, str]]:
+            space = body.latent_space
+            return list(zip(space.at_rest, space.shown, space.units, strict=True))
+
+        for place, _, display in self._by_code(displays):
+            at_rest[place], shown[place], units[place] = display
 
         def labels(body: Body) -> list[str]:
             groups = body.latent_space.groups
@@ -768,11 +769,9 @@ class SceneBody(Body):
             found = body.resolver.resolve(target[body.codes], body.options(options))
             latent[body.codes] = found.latent
         near = self.least_separated(latent, check)
-        return (
-            near
-            if len(near)
-            else np.array(self.separated_poses(latent)).reshape(-1, self.latent_size)
-        )
+        if len(near):
+            return near
+        return np.array(self.separated_poses(latent)).reshape(-1, self.latent_size)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -225,7 +226,9 @@ class CollisionDetector:
         self._nearness: ClearanceRule | None = None
         self._last_nearness: tuple[tuple[float, bool], ClearanceRule] | None = None
         self._may_touch: TouchingGroups = ()
-        self._paths: list[LinearPath] = []  # at most one, shared with copies
+        # Made when it is needed, and shared with copies.
+        unit = self.body_size
+        self._path = cache(lambda: LinearPath(topology, vertices / unit))
 
     @property
     def may_touch(self) -> TouchingGroups:
@@ -619,13 +622,11 @@ class CollisionDetector:
         ]
         if not np.isfinite(poses[1][self.topology.faces]).all():
             raise ShapeError("a vertex is not finite", where="the end pose of the path")
-        if not self._paths:
-            self._paths.append(LinearPath(self.topology, self.reference / self.body_size))
         moves = (poses[1] - poses[0])[self.topology.used_vertices]
         # A shift of the whole mesh brings no points nearer, but would make many boxes overlap.
         poses[1] = poses[1] - moves.mean(axis=0)
         length = float(np.percentile(np.linalg.norm(moves - moves.mean(axis=0), axis=1), 90))
-        edge = self._paths[0].edge * self.body_size / unit
+        edge = self._path().edge * self.body_size / unit
         step = max(_EDGES_A_STEP * edge, length / _MOST_STEPS)
         n = math.ceil(length / step) if length > 0.0 else 1
         between = [poses[0] + (poses[1] - poses[0]) * (at / n) for at in range(1, n)]
@@ -642,7 +643,7 @@ class CollisionDetector:
                 parts.append(self._tree.slot_face[searcher.found.slots[:n_found][counts]])
         middle = start[self.topology.faces].mean(axis=(0, 1))
         first, last = ((pose - middle) * (unit / self.body_size) for pose in (start, end))
-        return self._paths[0].touches(np.concatenate(parts), first, last)
+        return self._path().touches(np.concatenate(parts), first, last)
 
     def _exclusions_of(
         self, reference: FloatArray, rules: ContactRules, groups: Sequence[FaceGroup]

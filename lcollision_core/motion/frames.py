@@ -315,15 +315,13 @@ def chain_corrections(
     corrections : (D,) by frame, of the frames that were resolved
     """
     freed = {} if so_far is None else so_far
-    starts = [before, *[None] * (len(runs) - 1)]
     ways: list[tuple[Iterable[int], FloatArray | None]] = []
-    for run, near in zip(runs, starts, strict=False):
-        ways += [(run, near), (reversed(run), None)]
+    for number, run in enumerate(runs):
+        ways += [(run, None if number else before), (reversed(run), None)]
     chains = list(frames.pool.map(lambda way: _chained(frames, way[0], way[1], freed), ways))
     chosen: dict[int, FloatArray] = {}
-    for run, near, forwards, backwards in zip(
-        runs, starts, chains[::2], chains[1::2], strict=False
-    ):
+    for number, run in enumerate(runs):
+        near, (forwards, backwards) = ways[2 * number][1], chains[2 * number : 2 * number + 2]
         is_nearer = _cost(frames, run, forwards, near) <= _cost(frames, run, backwards, near)
         chosen |= forwards if is_nearer else backwards
     freed.update(chosen)
