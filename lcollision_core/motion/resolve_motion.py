@@ -526,7 +526,9 @@ class _Resolution:
         near = before[1] if before is not None and not was_free[0] else None
         freed = self.freed[span] = {}
         fractions = [_fractions(self.substeps[at]) for at in self._own(window)]
-        solutions: list[tuple[tuple[int, int, float], FloatArray, npt.NDArray[np.bool_]]] = []
+        solutions: list[
+            tuple[tuple[int, float, int, float], FloatArray, npt.NDArray[np.bool_]]
+        ] = []
         # If few frames first do not free all, or not smoothly, resolve each of them first.
         for knots in (knots_of(was_free, motion.in_frames(_SPACING)), np.ones_like(was_free)):
             start, known = np.zeros((len(window), motion.codes.shape[1])), was_free.copy()
@@ -551,7 +553,7 @@ class _Resolution:
             except CancelledError:
                 freed |= {window.start + at: moved for at, moved in program.so_far().items()}
                 raise
-            worth = int((~free).sum()), program.n_apart, program.cost(solution)
+            worth = int((~free).sum()), *program.rank, program.cost(solution)
             solutions.append((worth, solution, free))
             if knots.all() or (program.is_settled and not program.is_jerky(solution)):
                 break

@@ -413,9 +413,9 @@ class SpanProgram:
         return self._best is not None and self._is_settled(self._best)
 
     @property
-    def n_apart(self) -> int:
-        """Number of patches, summed over frames, that should touch and do not."""
-        return self._best.n_apart if self._best is not None else 0
+    def rank(self) -> tuple[float, int]:
+        """What the last search could not free; less is better."""
+        return self._best.rank if self._best is not None else (np.inf, 0)
 
     def so_far(self) -> dict[int, FloatArray]:
         """Return the (D,) corrections that free frames, if the search is stopped."""
