@@ -439,13 +439,37 @@ class _Resolution:
                 if self.job.cancelled:
                     raise
                 rest = self._without_finished(span)
-                freed = self.freed.pop(span, {})
+                freed = self._filled(span, self.freed.pop(span, {}))
                 if fixed := {at: freed[frame] for at, frame in enumerate(rest) if frame in freed}:
                     self._fit(rest, fixed)
                 own = self._own(rest)
                 self._bar(own, Reason.STOPPED)
                 if (self.wanted & ~(self.after & self._is_moved))[own].any():
                     self.unfinished.append(rest)
+
+    def _filled(self, span: range, freed: dict[int, FloatArray]) -> dict[int, FloatArray]:
+        """Free frames between those freed before a stop, from interpolated corrections."""
+        if not freed:
+            return freed
+        frames, known = self._with_still_feet(self.guard.frames, span), sorted(freed)
+        between = [
+            at for at in range(known[0], known[-1]) if at not in freed and self.wanted[at % self.n]
+        ]
+        ways = np.array([freed[at] for at in known]).T
+        starts = [
+            frames.motion.codes[at] + [np.interp(at, known, way) for way in ways] for at in between
+        ]
+        polished = frames.pool.map(frames.polished, between, starts)
+        return freed | {
+            at: codes - frames.motion.codes[at]
+            for at, (codes, _) in zip(between, polished, strict=True)
+            if codes is not None
+        }
+
+    def _with_still_feet(self, frames: Frames, span: range) -> Frames:
+        feet = np.flatnonzero(self.standing[self._own(span)].any(axis=0)).tolist()
+        still = frames.options.still_domains.union(feet)
+        return replace(frames, options=replace(frames.options, still_domains=still))
 
     def _without_finished(self, span: range) -> range:
         """Keep the finished beginning of a stopped span; return the rest, which is put back.
@@ -481,11 +505,8 @@ class _Resolution:
 
     def _solve(self, frames: Frames, span: range) -> None:
         frames.job.check()
-        own = self._own(span)
-        self.is_changed[own] = True
-        feet = np.flatnonzero(self.standing[own].any(axis=0)).tolist()
-        still = frames.options.still_domains.union(feet)
-        frames = replace(frames, options=replace(frames.options, still_domains=still))
+        self.is_changed[self._own(span)] = True
+        frames = self._with_still_feet(frames, span)
         reached = span.start
         for window in windows(span, self.motion.in_frames(WINDOW), self.motion.in_frames(OVERLAP)):
             known = [self.done[at] for at in self._own(window).tolist() if at in self.done]

@@ -254,7 +254,7 @@ def test_a_run_that_is_to_end_keeps_the_windows_that_are_done(
     assert found.after.tolist() == [bool(free) for free in check.are_free(codes)]
 
 
-@pytest.mark.parametrize(("share_of_polls", "all_free"), [(0.1, False), (0.9, True)])
+@pytest.mark.parametrize(("share_of_polls", "all_free"), [(0.1, False), (0.3, True)])
 def test_a_span_that_is_stopped_keeps_the_best_found_by_then(
     share_of_polls: float, all_free: bool
 ) -> None:
