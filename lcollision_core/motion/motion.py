@@ -461,6 +461,10 @@ def placed_frames(motion: Motion, check: ExactCheck) -> Iterator[FloatArray]:
 _STILL = 1e-9
 """Normalised displacement of a vertex up to which a frame counts as unchanged."""
 
+_UNSEEN_BEND = 1e-4
+"""Normalised second difference at `NOMINAL_RATE`, root mean square over the vertices, that counts
+as standing still: the acceleration of a motion is compared with at least that."""
+
 
 @dataclass(frozen=True)
 class MotionReport:
@@ -471,7 +475,8 @@ class MotionReport:
     mean_change : mean displacement over the vertices of the frames that changed
     largest_change : largest displacement of a vertex
     acceleration_ratio : mean squared second difference of the vertices after, over that before, in
-        the frames that changed and their neighbours; 1 if none changed
+        the frames that changed and their neighbours, with `_UNSEEN_BEND` squared added to both; 1
+        if none changed
     largest_jump : largest change of the correction from one frame to the next, as a mean over the
         vertices
     foot_slide : largest change of a standing part's mean displacement from one frame to the next
@@ -525,14 +530,13 @@ class MotionReport:
         near = touched.copy()
         near[1:] |= touched[:-1]
         near[:-1] |= touched[1:]
-        old_bend, new_bend = (
-            np.array([pair[side] for pair in bends])[near[1:-1]].sum() if bends else 0.0
-            for side in (0, 1)
-        )
+        unseen = (_UNSEEN_BEND * (NOMINAL_RATE / before.rate) ** 2) ** 2
+        near_bends = np.array(bends).reshape(-1, 2)[near[1:-1]] + unseen
+        old_bend, new_bend = near_bends.sum(axis=0)
         return cls(
             mean_change=float(np.mean(np.array(changes)[touched])) if touched.any() else 0.0,
             largest_change=max(largest),
-            acceleration_ratio=float(new_bend / old_bend) if old_bend > 0.0 else 1.0,
+            acceleration_ratio=float(new_bend / old_bend) if len(near_bends) else 1.0,
             largest_jump=max(jumps),
             foot_slide=max(slides),
         )

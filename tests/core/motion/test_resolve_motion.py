@@ -90,6 +90,27 @@ def test_the_motion_stays_near_and_as_smooth_as_it_was(resolved: ResolvedMotion)
     assert shaking.largest_jump > report.largest_jump
 
 
+def test_accelerations_too_small_to_see_count_as_alike() -> None:
+    body, motion = swinging()
+    check, still = body.exact_check(), np.tile(motion.codes[24], (6, 1))
+    side = np.array([0.0, 1.0, -1.0, 1.0, -1.0, 0.0])[:, None]
+    turn = np.eye(body.latent_size)[int(np.ptp(motion.codes, axis=0).argmax())]
+
+    def ratio(before: float, after: float, rate: float = 30.0) -> float:
+        both = (
+            Motion("still", np.arange(6) / rate, still + size * side * turn)
+            for size in (before, after)
+        )
+        return MotionReport.of(*both, check).acceleration_ratio
+
+    assert ratio(0.0, 0.0) == 1.0
+    assert ratio(1e-8, 1e-5) < 1.01
+    assert ratio(0.0, 0.03) > 10.0
+    assert 3.5 < ratio(0.05, 0.1) < 4.0
+    # The same poses follow each other faster, so they accelerate more.
+    assert ratio(0.0, 0.03, 120.0) > 100.0 * ratio(0.0, 0.03)
+
+
 def test_an_arm_that_passes_through_the_trunk_between_two_free_frames_goes_round_it() -> None:
     body, motion = through_the_trunk()
     check = body.exact_check()
