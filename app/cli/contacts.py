@@ -58,8 +58,9 @@ def contacts(
     sentence = rules_sentence(body.rules, excluded_at_rest(body))
     tell(f"{body.name}: {'every pair counts' if body.rules.exclude_nothing else sentence}")
     if proposed is not None:
+        verb = "collides" if proposed.n_colliding == 1 else "collide"
         tell(
-            f"  {proposed.n_colliding} of {counted(proposed.n_poses, 'pose')} collide, "
+            f"  {proposed.n_colliding} of {counted(proposed.n_poses, 'pose')} {verb}, "
             f"{proposed.n_colliding_then or 'none'} without {counted(len(proposed.new), 'place')} "
             "where parts touch in nearly all of them; --ignore-proposed leaves these out:"
         )

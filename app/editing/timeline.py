@@ -23,7 +23,7 @@ from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
 from lcollision_core.tasks.editing import free_neighbours, resolve_frames
 from lcollision_core.tasks.opening import OpenedModel, own_motions, read_motions
-from lcollision_core.tasks.words import counted, ground_text, joined, say
+from lcollision_core.tasks.words import counted, ground_text, joined, say, say_number
 
 if TYPE_CHECKING:
     from app.editing.history import PoseHistory
@@ -248,7 +248,7 @@ class MotionResolve(QObject):
         text = say("{frames} collided", frames=before)
         if self.is_ending:
             text = say("Stopped: {frames} collided", frames=before)
-        now = say("{n} still do", n=n_left) if n_left else "all are free now"
+        now = say_number(n_left, "{n} still does", "{n} still do") if n_left else "all are free now"
         kept_sentences = (span.sentence(part_names) for span in found.kept)
         ground = ground_text(None if found.ground is None else asdict(found.ground))
         return joined((text, now, *kept_sentences, ground))

@@ -318,9 +318,10 @@ def checked_clip_text(verdict: CheckedClip) -> str:
         parts.append(head)
     if frames and verdict.clearance > 0.0:
         parts.append(
-            say(
-                "{some} of {frames} have faces nearer than {distance}",
-                some=len(frames),
+            say_number(
+                len(frames),
+                "{n} of {frames} has faces nearer than {distance}",
+                "{n} of {frames} have faces nearer than {distance}",
                 frames=n_frames,
                 distance=near,
             )
@@ -328,10 +329,12 @@ def checked_clip_text(verdict: CheckedClip) -> str:
     elif frames:
         worst = max(frames, key=lambda frame: frame.deepest)
         parts.append(
-            say(
-                "{some} of {frames} collide, deepest frame {frame} by {depth:.2f} % of the body "
+            say_number(
+                len(frames),
+                "{n} of {frames} collides, deepest frame {frame} by {depth:.2f} % of the body "
                 "size ({parts})",
-                some=len(frames),
+                "{n} of {frames} collide, deepest frame {frame} by {depth:.2f} % of the body "
+                "size ({parts})",
                 frames=n_frames,
                 frame=worst.frame,
                 depth=100.0 * worst.deepest,
@@ -421,15 +424,21 @@ def resolved_pose_text(
 def resolved_clip_text(verdict: ResolvedClip) -> str:
     """Describe the outcome of resolving one motion of a file."""
     n, after, stuck = verdict.frames, verdict.free_after, verdict.colliding_frames
-    fields = {"before": verdict.free_before, "frames": n, "after": after}
+    fields = {"before": verdict.free_before, "frames": counted(n, "frame"), "after": after}
     if not verdict.output:
-        head = say("{before} of {frames} frames free", **fields)
+        head = say("{before} of {frames} free", **fields)
     elif after == n:
-        head = say("{before} of {frames} frames free before, all after", **fields)
+        head = say("{before} of {frames} free before, all after", **fields)
     else:
-        head = say("{before} of {frames} frames free before, {after} after", **fields)
+        head = say("{before} of {frames} free before, {after} after", **fields)
     if stuck:
-        head = say("{verdict} (frames {frames} collide)", verdict=head, frames=frames_text(stuck))
+        head = say_number(
+            len(stuck),
+            "{verdict} (frame {frames} collides)",
+            "{verdict} (frames {frames} collide)",
+            verdict=head,
+            frames=frames_text(stuck),
+        )
     parts: list[str | None] = [head]
     if not verdict.output and verdict.deepest_before:
         depth = 100.0 * verdict.deepest_before
@@ -537,17 +546,17 @@ def exported_text(
     elif n_frames is None:
         verdict = say_number(
             n_colliding,
-            "Exported {name}: {n} pair of its triangles collide",
+            "Exported {name}: {n} pair of its triangles collides",
             "Exported {name}: {n} pairs of its triangles collide",
             name=name,
         )
     else:
         verdict = say_number(
-            n_frames,
-            "Exported {name}: {some} of {n} frame collide",
-            "Exported {name}: {some} of {n} frames collide",
+            n_colliding,
+            "Exported {name}: {n} of {frames} collides",
+            "Exported {name}: {n} of {frames} collide",
             name=name,
-            some=n_colliding,
+            frames=counted(n_frames, "frame"),
         )
     return joined([verdict, *notes])
 

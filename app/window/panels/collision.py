@@ -872,9 +872,10 @@ class ProposalCard(Card):
                 "With {places} ignored, {n} poses still collide elsewhere.",
                 places=places,
             )
-        now = say(
+        now = say_number(
+            proposed.n_colliding,
+            "{n} of {poses} collides, and the same parts touch in nearly all of them.",
             "{n} of {poses} collide, and the same parts touch in nearly all of them.",
-            n=proposed.n_colliding,
             poses=counted(proposed.n_poses, "pose"),
         )
         self.text.setText(f"{now} {remaining}")

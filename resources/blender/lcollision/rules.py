@@ -86,7 +86,8 @@ class LCOLLISION_OT_propose(ModalOperator, bpy.types.Operator):
         kept = {name: reply[name] for name in ("touching", "touching_radius")}
         settings.proposal = json.dumps({"of": repr(rigged.key()), **kept})
         settings.proposed = (
-            f"{reply['colliding']} of {counted(reply['poses'], 'pose')} collide; without "
+            f"{reply['colliding']} of {counted(reply['poses'], 'pose')} "
+            f"collide{'s' if reply['colliding'] == 1 else ''}; without "
             f"{counted(len(reply['touching']), 'place')} that nearly always touch, "
             f"{reply['colliding_then'] or 'none'}"
         )

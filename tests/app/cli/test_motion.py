@@ -120,6 +120,9 @@ def test_a_point_cache_is_screened_with_its_mesh(
     colliding = np.flatnonzero(~body.exact_check().are_free(motion.codes[::6]))
     assert [one["frame"] for one in report["colliding_frames"]] == colliding.tolist()
     assert "component" in report["colliding_frames"][0]["parts"][0][0]
+    write_point_cache(tmp_path / "walk.mdd", body.decode(motion.codes[::6][colliding[:1]]))
+    alone = lcollision("check", tmp_path / "walk.obj", tmp_path / "walk.mdd")
+    assert ": 1 of 1 frame collides, deepest frame 0 by " in alone.stdout
 
 
 def test_a_clip_without_a_rig_has_its_own_rate(lcollision: Lcollision, tmp_path: Path) -> None:

@@ -544,7 +544,7 @@ def test_a_resolve_that_is_stopped_keeps_what_is_done(
     assert free(now.codes[changed]).all()
     n_left = int((~free(now.codes)).sum())
     n_before = int((~free(before.codes)).sum())
-    left = f"{n_left} still do" if n_left else "all are free now"
+    left = f"{n_left} still do{'es' * (n_left == 1)}" if n_left else "all are free now"
     assert told[-1].startswith(f"Stopped: {n_before} frames collided; {left}")
     assert n_left < n_before
     window.document.history.undo()

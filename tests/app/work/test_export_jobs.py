@@ -71,6 +71,7 @@ def test_a_motion_says_how_many_of_its_frames_collide(body: LearnedBody, tmp_pat
     steps: list[tuple[int, int]] = []
     for name, latent, verdict in (
         ("free.pc2", free, "no collisions (checked)"),
+        ("worst.mdd", colliding[:1], "1 of 1 frame collides"),
         ("bad.mdd", np.concatenate([free, colliding]), "2 of 5 frames collide"),
     ):
         told = export_frames(
@@ -97,9 +98,9 @@ def test_a_motion_of_a_character_is_one_file_for_each_of_its_meshes(
         export_frames(character, motion, tmp_path / name, ExportRequest(), Job())
         for name in ("run.pc2", "run.glb")
     )
-    assert caches == "Exported run Body.pc2, run Core.pc2, run Hat.pc2: 1 of 2 frames collide"
+    assert caches == "Exported run Body.pc2, run Core.pc2, run Hat.pc2: 1 of 2 frames collides"
     assert read_point_cache(tmp_path / "run Hat.pc2").shape[0] == 2
-    assert clip.startswith("Exported run.glb: 1 of 2 frames collide; its clip 'wave' is left out;")
+    assert clip.startswith("Exported run.glb: 1 of 2 frames collides; its clip 'wave' is left out;")
     frames = read_character(tmp_path / "run.glb").sample("poses", None)
     assert np.abs(frames.vertices - character.decode(motion.codes)).max() < 1e-5
 
