@@ -213,6 +213,9 @@ def read_shown(source: FbxDocument) -> Scene:
     if cached := answer["cached"].tolist():
         why = "not animated, as their geometry cache is not read (export PC2 or MDD instead)"
         notes.append(left_out_note(why, cached))
+    if smoothed := answer["smoothed"].tolist():
+        why = "not subdivided, as their levels are not read (apply them before the export)"
+        notes.append(left_out_note(why, smoothed))
     shown_nodes = answer["shown"].tolist()
     numbers, parts = [], []
     for number, node in enumerate(shown_nodes):
@@ -369,10 +372,10 @@ def _clips(source: FbxDocument, held: dict[str, Any], parts: tuple[int, ...]) ->
     names = make_unique([name or "clip" for name in held["clips"].tolist()])
     clips = []
     for number, (name, (start, end)) in enumerate(zip(names, held["spans"], strict=True)):
-        key_times = _frame_times(name, float(start), float(end), float(held["fps"]))
+        key_times = partial(_frame_times, name, float(start), float(end), float(held["fps"]))
         moved = frozenset(held[f"moved {number}"].tolist())
         sample = _FbxClip(source, number, parts)
-        clips.append(Clip(name, moved, partial(np.asarray, key_times), sample))
+        clips.append(Clip(name, moved, key_times, sample))
     return clips
 
 

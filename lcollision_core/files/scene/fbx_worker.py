@@ -34,6 +34,9 @@ _BARE = (ufbx.ElementType.UNKNOWN, ufbx.ElementType.EMPTY, ufbx.ElementType.BONE
 """Types of nodes that show nothing."""
 
 
+_SMOOTH = (ufbx.SubdivisionDisplayMode.HULL_AND_SMOOTH, ufbx.SubdivisionDisplayMode.SMOOTH)
+
+
 class _TooLargeError(Exception):
     pass
 
@@ -90,6 +93,9 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
             [node.name for node, mesh in shown_meshes if len(_kept(mesh.cache_deformers))],
             dtype=np.str_,
         ),
+        "smoothed": np.array(
+            [node.name for node, mesh in shown_meshes if _is_smoothed(mesh)], dtype=np.str_
+        ),
     }
     for number, (node, mesh) in enumerate(shown_meshes):
         part = _part(node, mesh, most_elements)
@@ -100,6 +106,12 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
     for number, (_, moved) in enumerate(clips):
         arrays[f"moved {number}"] = np.array(sorted(moved), dtype=np.int64)
     return arrays
+
+
+def _is_smoothed(mesh: Any) -> bool:
+    """Whether a mesh is shown or rendered subdivided."""
+    levels = max(mesh.subdivision_preview_levels, mesh.subdivision_render_levels)
+    return levels > 0 and mesh.subdivision_display_mode in _SMOOTH
 
 
 def _frames_per_second(settings: Any) -> float:

@@ -124,6 +124,40 @@ def test_a_geometry_cache_that_is_not_read_is_said(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("shown", "levels", "is_said"), [(2, 1, True), (1, 1, False), (3, 0, False)]
+)
+def test_a_subdivision_that_is_not_applied_is_said(
+    tmp_path: Path, shown: int, levels: int, is_said: bool
+) -> None:
+    path = arm_fbx(tmp_path / "arm.fbx")
+    values = f"Smoothness: {shown}\n        RenderDivisionLevels: {levels}\n"
+    mark = "GeometryVersion: 124"
+    path.write_text(path.read_text().replace(mark, f"{values}        {mark}", 1))
+    notes = read_character(path).notes
+    said = "not subdivided, as their levels are not read (apply them before the export): Body"
+    assert [note for note in notes if "subdivided" in note] == [said] * is_said
+
+
+def test_a_clip_of_too_many_frames_is_left_out_and_said(tmp_path: Path) -> None:
+    path = arm_fbx(tmp_path / "arm.fbx")
+    text = path.read_text()
+    stack = text[text.index("    AnimationStack: 500") : text.index("    AnimationLayer: 501")]
+    endless = stack.replace("500", "700").replace("wave", "endless")
+    endless = endless.replace(f'"",{TICKS}', f'"",{100_000 * TICKS}')
+    endless += 'AnimationLayer: 701, "AnimLayer::Base", "" { }\n'
+    endless += 'AnimationCurveNode: 710, "AnimCurveNode::", "" { }\n'
+    links = 'C: "OO",701,700\nC: "OO",710,701\nC: "OP",710,201, "Lcl Rotation"\n'
+    text = text.replace(stack, endless + stack)
+    path.write_text(text.replace("Connections:  {\n", "Connections:  {\n" + links))
+    character = read_character(path)
+    assert list(character.clips) == ["wave"]
+    assert character.topology.n_vertices == len(tube()[0])
+    (note,) = [note for note in character.notes if "endless" in note]
+    assert note.startswith("its clip 'endless' is left out: ")
+    assert "0 to 1000000 frames" in note
+
+
 def test_reading_stops_when_it_is_cancelled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
