@@ -41,6 +41,9 @@ _ROUGHER, _JUMP = 3.0, 0.1
 """A span is worse than before if a bone's change of velocity between frames exceeds both `_ROUGHER`
 times the former one and `_JUMP` times the skeleton's size."""
 
+_UNSEEN_BEND, _NOMINAL_RATE = 1e-4, 30.0
+"""Second difference at that rate, in sizes of the skeleton, that counts as standing still."""
+
 _FREE = ".free"
 _IN_FLIGHT = 8
 _BESIDE = 2
@@ -646,19 +649,20 @@ class ActionCopy:
 
     @property
     def acceleration(self) -> float:
-        """The mean squared acceleration of the bones' ends in the spans, relative to before."""
+        """The mean squared acceleration of the bones' ends in the spans, relative to before.
+
+        The square of one that nobody sees is added to both, as `MotionReport` does.
+        """
         near = {at for span in self._plan.spans for at in range(span.start - 1, span.stop + 1)}
         middles = np.array(sorted(near & set(range(1, len(self._frames.numbers) - 1))), int)
         lengths = self.rigged.lengths()
-        before, now = (
-            float(
-                (
-                    np.diff(_ends(np.array(one.transforms), lengths), 2, axis=0)[middles - 1] ** 2
-                ).sum()
-            )
-            for one in (self._frames, self.now)
-        )
-        return now / before if before > 0.0 else 1.0
+        both = [_ends(np.array(one.transforms), lengths) for one in (self._frames, self.now)]
+        render = bpy.context.scene.render
+        unseen = _UNSEEN_BEND * (_NOMINAL_RATE * render.fps_base / render.fps) ** 2
+        unseen *= np.ptp(both[0][0], axis=0).max()
+        bends = [np.diff(ends, 2, axis=0)[middles - 1] for ends in both]
+        before, now = ((bend**2).sum(axis=2) + unseen**2 for bend in bends)
+        return float(now.sum() / before.sum()) if len(middles) else 1.0
 
     def resolve(
         self, context: bpy.types.Context, character: OpenCharacter, wanted: Wanted, asked: dict
