@@ -439,7 +439,7 @@ class _Resolution:
                 if self.job.cancelled:
                     raise
                 rest = self._without_finished(span)
-                freed = self._filled(span, self.freed.pop(span, {}))
+                freed = self._filled(span, rest, self.freed.pop(span, {}))
                 if fixed := {at: freed[frame] for at, frame in enumerate(rest) if frame in freed}:
                     self._fit(rest, fixed)
                 own = self._own(rest)
@@ -447,13 +447,20 @@ class _Resolution:
                 if (self.wanted & ~(self.after & self._is_moved))[own].any():
                     self.unfinished.append(rest)
 
-    def _filled(self, span: range, freed: dict[int, FloatArray]) -> dict[int, FloatArray]:
-        """Free frames between those freed before a stop, from interpolated corrections."""
+    def _filled(
+        self, span: range, rest: range, freed: dict[int, FloatArray]
+    ) -> dict[int, FloatArray]:
+        """Free frames of a span's rest between those freed before a stop.
+
+        Each is polished from the interpolated correction.
+        """
         if not freed:
             return freed
         frames, known = self._with_still_feet(self.guard.frames, span), sorted(freed)
         between = [
-            at for at in range(known[0], known[-1]) if at not in freed and self.wanted[at % self.n]
+            at
+            for at in rest
+            if known[0] < at < known[-1] and at not in freed and self.wanted[at % self.n]
         ]
         ways = np.array([freed[at] for at in known]).T
         starts = [
