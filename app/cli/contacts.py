@@ -10,7 +10,7 @@ from app.cli.console import JsonOption, note, print_json, progress_bar, tell
 from app.cli.options import takes_options
 from app.cli.shared_options import ModelArgument
 from lcollision_core.options import RuleOptions
-from lcollision_core.tasks.words import counted
+from lcollision_core.tasks.words import counted, say_number
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, ProposedRules
@@ -58,11 +58,20 @@ def contacts(
     sentence = rules_sentence(body.rules, excluded_at_rest(body))
     tell(f"{body.name}: {'every pair counts' if body.rules.exclude_nothing else sentence}")
     if proposed is not None:
-        verb = "collides" if proposed.n_colliding == 1 else "collide"
+        fields = {
+            "poses": counted(proposed.n_poses, "pose"),
+            "then": proposed.n_colliding_then or "none",
+            "places": counted(len(proposed.new), "place"),
+        }
         tell(
-            f"  {proposed.n_colliding} of {counted(proposed.n_poses, 'pose')} {verb}, "
-            f"{proposed.n_colliding_then or 'none'} without {counted(len(proposed.new), 'place')} "
-            "where parts touch in nearly all of them; --ignore-proposed leaves these out:"
+            say_number(
+                proposed.n_colliding,
+                "  {n} of {poses} collides, {then} without {places} where parts touch in nearly "
+                "all of them; --ignore-proposed leaves these out:",
+                "  {n} of {poses} collide, {then} without {places} where parts touch in nearly "
+                "all of them; --ignore-proposed leaves these out:",
+                **fields,
+            )
         )
         for pair, number in proposed.places.items():
             tell(f"    {pair_in_words(pair)}: {counted(number, 'place')}")

@@ -33,8 +33,8 @@ _TIME_MODE_119_88 = 18
 _BARE = (ufbx.ElementType.UNKNOWN, ufbx.ElementType.EMPTY, ufbx.ElementType.BONE)
 """Types of nodes that show nothing."""
 
-
 _SMOOTH = (ufbx.SubdivisionDisplayMode.HULL_AND_SMOOTH, ufbx.SubdivisionDisplayMode.SMOOTH)
+"""Ways to show a mesh in which its subdivision is seen."""
 
 
 class _TooLargeError(Exception):
