@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import NearestPair, SelfCollisions
+from lcollision_core.contact import DEPTH_TOLERANCE, NearestPair, SelfCollisions
 from lcollision_core.devices import block_size, uses_gpu
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes.contact_rules import ExcludedPairs, RuleCounts
@@ -143,13 +143,33 @@ class Frames:
         ----------
         share : fraction of the way, in (0, 1)
         """
+        separated = (
+            self._separated(check, codes)
+            for check, codes in self._poses_between(frame, share, start, end)
+        )
+        return next((contacts for contacts in separated if contacts is not None), None)
+
+    def overlap_between(
+        self, frame: int, share: float, start: FloatArray, end: FloatArray
+    ) -> SelfCollisions | None:
+        """Return the collisions of the first pose of `contacts_between` that collides, or None."""
+        collisions = (
+            check.collisions(codes)
+            for check, codes in self._poses_between(frame, share, start, end)
+        )
+        return next((pose for pose in collisions if pose.colliding), None)
+
+    def _poses_between(
+        self, frame: int, share: float, start: FloatArray, end: FloatArray
+    ) -> Iterator[tuple[ExactCheck, FloatArray]]:
+        """Yield the checks and (D,) codes of the poses on the way from a frame to the next."""
         codes = (1.0 - share) * start + share * end
         motion = self.motion
         check = motion.check(frame, self._check_between, share)
         if motion.placements is None:
-            contacts = self._separated(check, codes)
-            if contacts is not None or not self.continuous:
-                return contacts
+            yield check, codes
+            if not self.continuous:
+                return
         # With placements, or if `continuous`, interpolate the vertices.
         ends = (motion.check(at, self._check_between) for at in (frame, frame + 1))
         meshes = (
@@ -160,7 +180,7 @@ class Frames:
         blended_codes, place = (1.0 - share) * first + share * second, check.placement
         blended_codes = blended_codes if place is None else place.inverse().apply(blended_codes)
         shaped = check.space.shaped_as(codes, blended_codes.astype(np.float64) / check.body_size)
-        return self._separated(replace(check, space=shaped), codes)
+        yield replace(check, space=shaped), codes
 
     def are_free(
         self, frames: Sequence[int], job: Job = UNWATCHED, codes: FloatArray | None = None
@@ -753,27 +773,38 @@ class Guard:
             free[at] = is_free
             if reason is not None:
                 reasons[at] = reason
-        last = len(self.frames.motion) - 1
+        last, nexts = len(self.frames.motion) - 1, (np.arange(self.n) + 1) % self.n
+        is_changed = (codes != self.frames.motion.codes[: self.n]).any(axis=1)
+        is_freed = free & ~self.was_free
+        judged_ways = (is_changed | is_changed[nexts]) & ~(is_freed | is_freed[nexts])
         pairs = [at % self.n for at in range(span.start - 1, span.stop)]
-        frames_to_check = [
-            at
-            for at in pairs
-            if at < last and self.was_clear_between[at] and free[at] and free[(at + 1) % self.n]
-        ]
-
-        def collides(at: int) -> bool:
-            both = codes[at], codes[(at + 1) % self.n]
-            return any(
-                self.frames.contacts_between(at, share, *both) is not None
-                for share in fractions[at].tolist()
-            )
-
-        for at, hit in zip(
-            frames_to_check, self.frames.pool.map(collides, frames_to_check), strict=True
-        ):
-            if hit:
+        pairs = [at for at in pairs if at < last and judged_ways[at]]
+        worse = self.frames.pool.map(
+            lambda at: self._is_worse_between(at, codes, fractions[at].tolist()), pairs
+        )
+        for at, is_worse in zip(pairs, worse, strict=True):
+            if is_worse:
                 reasons.setdefault(at, Reason.BETWEEN)
         return reasons
+
+    def _is_worse_between(self, at: int, codes: FloatArray, shares: Sequence[float]) -> bool:
+        """Whether a pose on the way from a frame to the next is worse than all were there."""
+
+        def between(rows: FloatArray) -> list[SelfCollisions]:
+            ends = rows[at], rows[(at + 1) % self.n]
+            poses = (self.frames.overlap_between(at, share, *ends) for share in shares)
+            return [pose for pose in poses if pose is not None]
+
+        new = between(codes)
+        if not new or self.was_clear_between[at]:
+            return bool(new)
+        was = self.frames.motion.codes[: self.n]
+        ends = (at, (at + 1) % self.n)
+        old = [*between(was), *(self._overlap(end, was[end]) for end in ends)]
+        n_pairs, deepest = max(pose.n_pairs for pose in old), max(pose.deepest for pose in old)
+        return any(
+            pose.n_pairs > n_pairs or pose.deepest > deepest + DEPTH_TOLERANCE for pose in new
+        )
 
     def _judge(self, at: int, codes: FloatArray) -> tuple[bool, Reason | None]:
         was = self.frames.motion.codes[at]
@@ -788,8 +819,7 @@ class Guard:
         return not overlap.colliding, Reason.NOT_FOUND if is_worse else None
 
     def _overlap(self, at: int, codes: FloatArray) -> SelfCollisions:
-        check = self.frames.check(at)
-        return check.find(check.exported(check.decode(codes)[0]))
+        return self.frames.check(at).collisions(codes)
 
     def kept(self, run: range, codes: FloatArray, reasons: Mapping[int, Reason]) -> KeptSpan | None:
         """Describe a run of frames that collide, or did; None if it is free and was changed.

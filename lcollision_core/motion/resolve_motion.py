@@ -104,9 +104,10 @@ def resolve_motion(
     the vertices between two frames are solved again with more poses there, until nothing does.
 
     No frame gets more pairs or deeper ones than it had, no free frame collides, and no vertex moves
-    farther than the largest change. Frames that cannot be resolved within these limits are left
-    out, and the frames around them are resolved without them. They then get the least overlap found
-    within the limits, or stay unchanged to the bit.
+    farther than the largest change. Poses between two frames, neither of which is freed, get no
+    more pairs or deeper ones than there were from one to the next. Frames that cannot be resolved
+    within these limits are left out, and the frames around them are resolved without them. They
+    then get the least overlap found within the limits, or stay unchanged to the bit.
 
     In a scene, each body is resolved separately first, and then the spans that still collide, as
     where bodies meet. If that makes a frame worse, all bodies are resolved together from the start.
@@ -615,6 +616,12 @@ class _Resolution:
                 continue
             inside = runs((self.colliding & ~self.barred)[own])
             for at, reason in faults.items():
+                ends = (at, (at + 1) % self.n) if reason is Reason.BETWEEN else (at,)
+                eased = [end for end in ends if end in places and not self.colliding[end]]
+                if eased:
+                    # They need not change.
+                    self._bar(np.array(eased), reason)
+                    continue
                 # A pose before the span belongs to its first frame.
                 place = places.get(at, 0)
                 nearest = min(inside, key=lambda run: max(run.start - place, place - run.stop + 1))

@@ -203,6 +203,10 @@ class ExactCheck:
                 break
         return collisions
 
+    def collisions(self, latent: FloatArray) -> SelfCollisions:
+        """Find the colliding pairs of a (D,) latent pose as it is exported."""
+        return self.find(self.exported(self.decode(latent)[0]))
+
     def collide_between(
         self, start: npt.NDArray[np.floating], end: npt.NDArray[np.floating]
     ) -> bool:

@@ -184,7 +184,7 @@ class Ladder:
         """Try the steps until one resolves the collisions, then pull back."""
         problem, check = self.problem, self.check
         problem.deadline.poll()
-        before = check.find(check.exported(check.decode(problem.target)[0]))
+        before = check.collisions(problem.target)
         latent, step, note = problem.target, Step.NONE, None
         if not before.colliding:
             step = Step.UNCHANGED

@@ -55,7 +55,7 @@ def print_pose(
     """
     require_output(path, *PRINT_SUFFIXES)
     check = body.exact_check(pose.placement, own and own())
-    before = check.find(check.exported(check.decode(pose.latent)[0]))
+    before = check.collisions(pose.latent)
     latent = pose.latent
     if options.resolve and body.can_resolve and before.colliding:
         resolver = body.resolver if own is None else body.resolver.with_check(check)

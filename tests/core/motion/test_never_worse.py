@@ -60,6 +60,7 @@ def require_no_worse(
     for span in found.spans:
         may_change[span.start : span.stop] = True
     assert after.codes[~may_change].tobytes() == before.codes[~may_change].tobytes()
+    is_freed = found.after & ~found.before
     for frame in range(len(before)):
         old, new = (motion.vertices(frame, check) for motion in (before, after))
         moved = np.linalg.norm(new - old, axis=1).max() / body.body_size
@@ -71,6 +72,12 @@ def require_no_worse(
         assert depth_after <= depth_before + 2e-9
         assert bool(found.after[frame]) == (n_after == 0)
         assert named[frame] or n_after == 0
+        if frame + 1 < len(before) and not is_freed[frame : frame + 2].any():
+            was = [overlaps(body, before.vertices(frame, check, share)) for share in (0.0, 0.5)]
+            was.append(overlaps(body, before.vertices(frame + 1, check)))
+            n_between, depth_between = overlaps(body, after.vertices(frame, check, 0.5))
+            assert n_between <= max(n for n, _ in was)
+            assert depth_between <= max(depth for _, depth in was) + 2e-9
 
 
 def figure(n_arms: int, radius: float) -> tuple[Rig, Topology, FloatArray]:
