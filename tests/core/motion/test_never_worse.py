@@ -32,7 +32,15 @@ from lcollision_core.motion import (
 from lcollision_core.resolve import ResolveOptions
 from tests.core.brute_force import all_pairs
 from tests.core.motion.swings import CLIP, swinging, swinging_body
-from tests.rigged_shapes import character_of, limb, limb_faces, skinned, turned, write_gltf
+from tests.rigged_shapes import (
+    character_of,
+    limb,
+    limb_faces,
+    rigged_body,
+    skinned,
+    turned,
+    write_gltf,
+)
 
 UP = (0.0, 0.0, 1.0)
 
@@ -217,6 +225,31 @@ def test_within_a_small_change_a_span_gets_less_overlap() -> None:
     assert 0.0 < kept.deepest < 0.9 * was
     assert "overlap as little as was found" in kept.sentence(body.domain_names)
     require_no_worse(body, motion, found, 0.02)
+
+
+def test_the_way_between_two_free_frames_gets_no_deeper() -> None:
+    """An arm swings through a leg from one free frame to another."""
+    body = RigBody.of(rigged_body())
+    rig = body.space.rig
+    turns = {
+        "Spine": [[-0.3, 0, 0], [0.17, 0, 0], [0.11, 0, 0], [-0.29, 0, 0]],
+        "LeftArm": [[-0.1, 1.02, 0], [0.12, 1.51, 0], [-0.04, 1.06, 0], [-0.07, 1.38, 0]],
+        "LeftForeArm": [[0, 0, -1.29], [0, 0, -1.04], [0, 0, -0.84], [0, 0, -1.42]],
+        "RightArm": [[0.26, -1.34, 0], [-0.48, -1.32, 0], [0.52, -1.1, 0], [-0.36, -1.16, 0]],
+        "RightForeArm": [[0, 0, 1.26], [0, 0, 0.52], [0, 0, 1.0], [0, 0, 1.0]],
+        "RightUpLeg": [[-0.35, -0.14, 0], [0.32, -0.25, 0], [0.07, -0.25, 0], [-0.38, -0.15, 0]],
+    }
+    vectors = np.zeros((4, len(rig.parents), 3))
+    for name, way in turns.items():
+        vectors[:, rig.joint_names.index(name)] = way
+    transforms = [turned(rig, Rotation.from_rotvec(frame).as_matrix()) for frame in vectors]
+    codes = body.space.codes_of_transforms(np.stack(transforms))
+    motion = Motion("swing", np.arange(4) / 8.0, codes)
+    options = MotionOptions(frame=ResolveOptions(largest_change=0.02))
+    result = resolve_motion(body.resolver, motion, UP, options)
+    assert result.before[:2].all()
+    assert 0 in screen_motion(motion, body.exact_check()).in_between
+    require_no_worse(body, motion, result, 0.02)
 
 
 def test_what_a_file_cannot_hold_is_put_back_in_it(tmp_path: Path) -> None:
