@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.sparse import csgraph, csr_matrix, linalg
+import scipy
 
 from lcollision_core.acap.features import (
     BRIDGE_WEIGHT,
@@ -100,20 +99,20 @@ def factor_poisson(
     order = np.argsort(rows, kind="stable")
 
     graph = edge_graph(edges, n_vertices, edge_weights)
-    count, component = csgraph.connected_components(graph, directed=False)
+    count, component = scipy.sparse.csgraph.connected_components(graph, directed=False)
     _, pinned = np.unique(component, return_index=True)
     free = np.setdiff1d(np.arange(n_vertices), pinned)
     position = np.empty(n_vertices, dtype=np.int32)
     position[pinned] = np.arange(len(free), n_vertices)
     # The matrix is positive definite, so no pivoting is needed and U = D lower^T.
-    factors = linalg.splu(
-        csgraph.laplacian(graph).tocsc()[free][:, free],
+    factors = scipy.sparse.linalg.splu(
+        scipy.sparse.csgraph.laplacian(graph).tocsc()[free][:, free],
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
     position[free] = factors.perm_c
-    strict = sparse.tril(factors.L, -1).tocsc()
+    strict = scipy.sparse.tril(factors.L, -1).tocsc()
 
     totals = np.bincount(component, anchor_weights, minlength=count)
     anchor = np.where(totals[component] > 0.0, anchor_weights, 1.0)
@@ -453,7 +452,7 @@ def cotangent_weights(topology: Topology, rest_vertices: FloatArray, floor: floa
     sound = sine > _DEGENERATE_SINE * product
     cotangent = np.where(sound, cosine / np.where(sound, sine, 1.0), 0.0)
     # The matrix sums duplicates and sorts its entries like the edges.
-    sums = sparse.csr_matrix(
+    sums = scipy.sparse.csr_matrix(
         (cotangent.ravel(), (np.minimum(start, end).ravel(), np.maximum(start, end).ravel())),
         shape=(topology.n_vertices, topology.n_vertices),
     )
@@ -647,7 +646,7 @@ class AcapCodec:
         for_blocks(pull_block, len(given), BLOCK_POSES, n_threads)
         return grad_features
 
-    def means_by_gradients(self, weights: csr_matrix) -> FloatArray:
+    def means_by_gradients(self, weights: scipy.sparse.csr_matrix) -> FloatArray:
         """Differentiate patches' means by the deformation gradients, for `means_vjp`.
 
         These are the same in every pose, as vertices are linear in deformation gradients.

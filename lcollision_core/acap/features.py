@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_matrix, csgraph
-from scipy.spatial import Delaunay, QhullError, cKDTree
+import scipy
 
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.meshes.normals import vertex_normals
@@ -345,8 +344,8 @@ def component_bridges(
     edges, ends, lengths = edges[order], ends[order], lengths[order]
     pairs, first, pair_of = np.unique(ends, axis=0, return_index=True, return_inverse=True)
     shape = (n_components, n_components)
-    graph = coo_matrix((lengths[first], tuple(pairs.T)), shape=shape).tocsr()
-    tree = csgraph.minimum_spanning_tree(graph).tocoo()
+    graph = scipy.sparse.coo_matrix((lengths[first], tuple(pairs.T)), shape=shape).tocsr()
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(graph).tocoo()
     of_tree = np.zeros(shape, dtype=np.bool_)
     of_tree[tree.row, tree.col] = True
     rank = np.arange(len(edges)) - first[pair_of.ravel()]
@@ -367,8 +366,8 @@ def component_bridges(
 def _neighbours(points: FloatArray) -> npt.NDArray[np.intp]:
     """Return (n, 2) edges of the Delaunay triangulation of points, none if there is none."""
     try:
-        delaunay = Delaunay(points)
-    except QhullError:
+        delaunay = scipy.spatial.Delaunay(points)
+    except scipy.spatial.QhullError:
         return np.empty((0, 2), dtype=np.intp)
     edges = [delaunay.simplices[:, pair] for pair in combinations(range(4), 2)]
     # The triangulation leaves out points that coincide with others.
@@ -379,7 +378,7 @@ def _to_the_largest(points: FloatArray, of_point: npt.NDArray[np.intp]) -> npt.N
     """Return an edge from each component to the largest, so that all are surely joined."""
     main = np.flatnonzero(of_point == np.bincount(of_point).argmax())
     others = np.setdiff1d(np.arange(len(points)), main)
-    distance, nearest = cKDTree(points[main]).query(points[others])
+    distance, nearest = scipy.spatial.cKDTree(points[main]).query(points[others])
     order = np.lexsort((distance, of_point[others]))
     _, first = np.unique(of_point[others][order], return_index=True)
     first_edges = order[first]

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csgraph, csr_matrix
+import scipy
 
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.meshes.topology import FloatArray, IntArray
@@ -152,7 +152,7 @@ _N_LANDMARKS = 8
 _DONE = -1.0
 
 
-def component_roots(graph: csr_matrix) -> IntArray:
+def component_roots(graph: scipy.sparse.csr_matrix) -> IntArray:
     """Find the vertex of each connected component that is nearest to its middle along the surface.
 
     The same root in every pose keeps poses comparable. On a body it lies in the trunk, which
@@ -167,12 +167,14 @@ def component_roots(graph: csr_matrix) -> IntArray:
     -------
     roots : (n_components,) int32 array, ordered by the component's number
     """
-    count, component = csgraph.connected_components(graph, directed=False)
+    count, component = scipy.sparse.csgraph.connected_components(graph, directed=False)
     order = np.argsort(component, kind="stable")
     starts = np.searchsorted(component[order], np.arange(count))
 
     def distances_from(landmarks: npt.NDArray[np.signedinteger]) -> FloatArray:
-        distances: FloatArray = csgraph.dijkstra(graph, indices=landmarks, min_only=True)
+        distances: FloatArray = scipy.sparse.csgraph.dijkstra(
+            graph, indices=landmarks, min_only=True
+        )
         return distances
 
     nearest = distances_from(order[starts])

@@ -9,8 +9,7 @@ from functools import cache, cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter1d
-from scipy.spatial import cKDTree
+import scipy
 
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.partners import common_name
@@ -112,7 +111,7 @@ class Correspondence:
             for side in points:
                 axis = turned[1] @ space.up if limb == _TRUNK else side.mean(axis=0)
                 places.append(_places(side, axis, space.front, space.up))
-            image[inside] = own_vertices[cKDTree(places[1]).query(places[0])[1]]
+            image[inside] = own_vertices[scipy.spatial.cKDTree(places[1]).query(places[0])[1]]
         return image
 
     def patch(self, middle: FloatArray, limb: int, radius: float) -> npt.NDArray[np.intp]:
@@ -242,7 +241,9 @@ class _Samples:
         points, at_rest = (
             _at(pose, self.faces, self.face, self.weights) for pose in (vertices, self.rest)
         )
-        pairs = cKDTree(points).query_pairs(_TOUCHING + _SPACING, output_type="ndarray")
+        pairs = scipy.spatial.cKDTree(points).query_pairs(
+            _TOUCHING + _SPACING, output_type="ndarray"
+        )
         pairs = pairs[self.part[pairs[:, 0]] != self.part[pairs[:, 1]]]
         away = np.linalg.norm(at_rest[pairs[:, 0]] - at_rest[pairs[:, 1]], axis=1)
         pairs = pairs[away > _AT_REST]
@@ -391,7 +392,7 @@ def _sliding(
         if (images < 0).any():
             return None
         middles = both.retargeting.space.rest_vertices[images]
-        middles = gaussian_filter1d(middles, _STEADY, axis=0, mode="nearest")
+        middles = scipy.ndimage.gaussian_filter1d(middles, _STEADY, axis=0, mode="nearest")
         limbs = both.limbs[images].tolist()
         sides.append(
             [both.patch(middle, limb, _PATCH) for middle, limb in zip(middles, limbs, strict=True)]

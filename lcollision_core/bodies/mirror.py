@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
+import scipy
 
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import PoseSetError, ShapeError, WrongScaleError
 from lcollision_core.files.mesh_file import can_hold, first_not_finite
+from lcollision_core.files.scene.transforms import from_rotation_vectors
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform, Topology, body_size
 from lcollision_core.meshes.joint_kinds import Role, Side
@@ -458,7 +458,7 @@ def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int)
     used, faces = topology.used_vertices, topology.faces
     vertices = np.asarray(reference, dtype=np.float64)[used]
     size = float(np.ptp(vertices, axis=0).max())
-    tree = cKDTree(vertices)
+    tree = scipy.spatial.cKDTree(vertices)
     everyone = np.arange(len(vertices), dtype=np.int32)
     best: tuple[float, Symmetry] | None = None
     for axis in (axis for axis in range(3) if axis != up_axis):
@@ -619,7 +619,7 @@ def _by_place(
     places = np.column_stack([space.origins[joints], _NEARER * np.array(kinds)])
     image = places.copy()
     image[:, :3] -= 2.0 * np.outer(space.origins[joints] @ normal - offset, normal)
-    distance, nearest = cKDTree(places).query(image)
+    distance, nearest = scipy.spatial.cKDTree(places).query(image)
     # Joints in one position, such as twist joints, are matched in order.
     for place in np.unique(nearest):
         same = np.flatnonzero(np.linalg.norm(places - places[place], axis=1) < 1e-6)
@@ -668,7 +668,7 @@ def _between(space: RigPoseSpace, partner: npt.NDArray[np.intp], normal: FloatAr
             sine = float(np.linalg.norm(axis))
             if sine > _NEARER * lengths:
                 angle = np.arctan2(sine, image @ mean_bone)
-                between[joint] = Rotation.from_rotvec(angle * axis / sine).as_matrix()
+                between[joint] = from_rotation_vectors(angle * axis / sine)
     return between
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+import scipy
 
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.export import shapes_in_file, source_for
@@ -157,7 +157,10 @@ def motion_of_smpl(body: Body, path: Path, fps: float | None = None) -> Motion:
     turns = np.zeros((len(motion), space.n_joints, 3))
     for joint, number in _pairs(space, motion):
         turns[:, joint] = motion.turns[:, number]
-    turns[:, 0] = (Rotation.from_matrix(frame) * Rotation.from_rotvec(turns[:, 0])).as_rotvec()
+    turns[:, 0] = (
+        scipy.spatial.transform.Rotation.from_matrix(frame)
+        * scipy.spatial.transform.Rotation.from_rotvec(turns[:, 0])
+    ).as_rotvec()
     pelvis = space.rig.rest[0, :3, 3]
     codes = space.codes_of_rotations(turns, (pelvis + motion.places) @ frame.T - pelvis)
     times = np.arange(len(motion)) / (fps or motion.rate or NOMINAL_RATE)
@@ -190,7 +193,8 @@ def write_smpl(
     for row, pose in enumerate(codes):
         own_turns, shift = space.rotations_of(pose)
         own_turns[0] = (
-            Rotation.from_matrix(frame.T) * Rotation.from_rotvec(own_turns[0])
+            scipy.spatial.transform.Rotation.from_matrix(frame.T)
+            * scipy.spatial.transform.Rotation.from_rotvec(own_turns[0])
         ).as_rotvec()
         for joint, number in _pairs(space, motion):
             turns[row, number] = own_turns[joint]

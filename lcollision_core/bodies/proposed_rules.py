@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+import scipy
 
 from lcollision_core.bodies.body import Body
 from lcollision_core.contact import touching_patches
@@ -126,7 +126,7 @@ def mirrored(body: Body, pairs: Iterable[FacePair]) -> list[FacePair]:
     if symmetry is None:
         return []
     middles = body.reference[body.faces].mean(axis=1)
-    away, partner = cKDTree(middles).query(symmetry.reflect(middles))
+    away, partner = scipy.spatial.cKDTree(middles).query(symmetry.reflect(middles))
     is_there = away <= TOUCHING_RADIUS * body.body_size
     return [
         (int(min(partner[a], partner[b])), int(max(partner[a], partner[b])))

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.partners import (
@@ -55,6 +54,7 @@ from lcollision_core.files.motion.smpl import is_smpl_motion, read_smpl_motion, 
 from lcollision_core.files.motion.vrma import read_vrma, vrma_bytes
 from lcollision_core.files.safe import atomic_write
 from lcollision_core.files.scene.scene import nearest_above
+from lcollision_core.files.scene.transforms import from_rotation_vectors, rotation_vectors
 from lcollision_core.files.scene_files import as_file_error, read_skeleton_scene
 from lcollision_core.files.table import BVH_SUFFIX, SKELETON_SUFFIXES, VRMA_SUFFIX
 from lcollision_core.meshes.joint_kinds import Role, Side
@@ -167,8 +167,8 @@ class Retargeting:
                 above = int(self.motion.parents[partner])
                 if self.share[joint] < 1.0 and above >= 0:
                     local = np.swapaxes(turns[:, above], 1, 2) @ turned
-                    part = self.share[joint] * Rotation.from_matrix(local).as_rotvec()
-                    turned = turns[:, above] @ Rotation.from_rotvec(part).as_matrix()
+                    part = self.share[joint] * rotation_vectors(local)
+                    turned = turns[:, above] @ from_rotation_vectors(part)
                 moved[:, joint] = self.frame @ turned @ self.frame.T @ self.aligned[joint]
             if joint == self._hips:
                 way = (places[:, partner] - self._rest_of(partner)) @ self.frame.T

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+import scipy
 
 from lcollision_core.bodies.body import Body, ModelCard, read_only
 from lcollision_core.bodies.mirror import (
@@ -704,7 +704,7 @@ class RigBody(Body):
             return None
         everyone = np.arange(self.n_vertices, dtype=np.int32)
         plane = Symmetry(everyone, sides.normal, sides.offset * self.body_size)
-        partner = cKDTree(self.reference).query(plane.reflect(self.reference))[1]
+        partner = scipy.spatial.cKDTree(self.reference).query(plane.reflect(self.reference))[1]
         return replace(plane, partner=read_only(partner.astype(np.int32)))
 
     @cached_property

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+import scipy
 
 from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
 from lcollision_core.bodies.skeletons import limb_children
@@ -320,7 +320,7 @@ class _Body:
             wrist = _frame(mirror * arm.palm_towards, mirror * arm.hand)
             wrist = wrist @ _frame(np.array([-side, 0.0, 0.0]), np.array([0.0, -1.0, 0.0])).T
             # The forearm twists as much as the hand needs.
-            x, y, z, w = Rotation.from_matrix(elbow.T @ wrist).as_quat()
+            x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(elbow.T @ wrist).as_quat()
             del x, z
             elbow = elbow @ _turn(0.0, np.degrees(2.0 * np.arctan2(y, w)), 0.0)
         turns = {
@@ -402,7 +402,9 @@ class _Body:
 
 def _turn(left: float, up: float, front: float) -> FloatArray:
     """Return the rotation by degrees about one of left, up and front."""
-    matrix: FloatArray = Rotation.from_rotvec([left, up, front], degrees=True).as_matrix()
+    matrix: FloatArray = scipy.spatial.transform.Rotation.from_rotvec(
+        [left, up, front], degrees=True
+    ).as_matrix()
     return matrix
 
 

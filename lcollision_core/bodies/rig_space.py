@@ -10,15 +10,18 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
-from scipy.spatial.transform import Rotation
+import scipy
 
 from lcollision_core.bodies import rig_kernels
 from lcollision_core.bodies.rig_kernels import Influences, JointFrames, Motions, PoseShapes
 from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, axes_of, joint_limits, rig_of
 from lcollision_core.errors import ShapeError
 from lcollision_core.files.character import Character, Rig
-from lcollision_core.files.scene.transforms import nearest_winding
+from lcollision_core.files.scene.transforms import (
+    from_rotation_vectors,
+    nearest_winding,
+    rotation_vectors,
+)
 from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.limbs import LEAST_LIMB, Limbs
@@ -421,7 +424,7 @@ class RigPoseSpace:
         return np.maximum(_STRETCH_SLACK * longest, shortest).astype(np.float64)
 
     @cached_property
-    def surface_graph(self) -> csr_matrix:
+    def surface_graph(self) -> scipy.sparse.csr_matrix:
         """(V, V) lengths of the edges in the reference."""
         return length_graph(self.topology.edges, self.rest_vertices)
 
@@ -674,7 +677,9 @@ class RigPoseSpace:
         by_shapes: FloatArray = np.add.reduceat(moved, first[:-1], axis=1)
         return by_shapes
 
-    def mean_slopes(self, weights: csr_matrix) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    def mean_slopes(
+        self, weights: scipy.sparse.csr_matrix
+    ) -> Callable[[FloatArray, FloatArray], FloatArray]:
         """Prepare the derivatives of patches' means by the codes; see `posing.PoseSpace`.
 
         Straight elbows and knees count as slightly bent: to first order, bending a straight limb
@@ -754,10 +759,8 @@ class RigPoseSpace:
                 parent_axes = np.where(is_hidden[:, None, None], linear[:, parent], parent_axes)
             local = _nearest_rotations(np.linalg.inv(before) @ parent_axes @ axes)
             places = slice(3 + 3 * bone, 6 + 3 * bone)
-            numbers[:, places] = np.where(
-                is_held[places], Rotation.from_matrix(local).as_rotvec(), 0.0
-            )
-            turned = Rotation.from_rotvec(numbers[:, places]).as_matrix()
+            numbers[:, places] = np.where(is_held[places], rotation_vectors(local), 0.0)
+            turned = from_rotation_vectors(numbers[:, places])
             linear[:, bone] = before @ turned @ self._bone_inverses[bone]
         if self._bones[0] >= 0:
             origin = self._bone_origins[0]
@@ -879,7 +882,7 @@ class RigPoseSpace:
         numbers = np.zeros((len(codes), 3 + 3 * len(self._bones)))
         numbers[:, self._place] = codes[:, : len(self._place)]
         offsets[:, 0] -= numbers[:, :3] @ self.body_axes.T
-        turned = Rotation.from_rotvec(numbers[:, 3:].reshape(-1, 3)).as_matrix()
+        turned = from_rotation_vectors(numbers[:, 3:].reshape(-1, 3))
         turned = turned.reshape(linear.shape)
         return JointOffsets(
             (back @ offsets[..., None])[..., 0] - origins,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.mesh_body import MeshBody
@@ -22,6 +22,7 @@ from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember,
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.files import Character, Rig, read_character, read_mesh
 from lcollision_core.files.safe import atomic_write, read_regular
+from lcollision_core.files.scene.transforms import from_rotation_vectors
 from lcollision_core.files.table import READABLE_SUFFIXES, SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.json_values import from_json, parse_document, parse_json
 from lcollision_core.meshes import RigidTransform, Topology
@@ -199,9 +200,11 @@ def _place(part: ScenePart, body: Body, first: Body) -> RigidTransform:
     """Return the transform from a body's coordinates to the scene's."""
     turn = np.eye(3)
     if body.up_axis != first.up_axis:
-        turn = Rotation.align_vectors([np.array(first.up)], [np.array(body.up)])[0].as_matrix()
+        turn = scipy.spatial.transform.Rotation.align_vectors(
+            [np.array(first.up)], [np.array(body.up)]
+        )[0].as_matrix()
         turn = np.round(turn)
-    about = Rotation.from_rotvec(np.radians(part.turn) * np.array(first.up)).as_matrix()
+    about = from_rotation_vectors(np.radians(part.turn) * np.array(first.up))
     scale = body.card.metres / first.card.metres
     return RigidTransform(about @ turn, np.array(part.at, dtype=np.float64), scale)
 

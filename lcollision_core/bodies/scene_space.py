@@ -10,8 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import block_diag as sparse_block_diag
-from scipy.sparse import csr_matrix
+import scipy
 
 from lcollision_core.bodies.rig_space import ROOT_CODES
 from lcollision_core.meshes import RigidTransform, Topology
@@ -48,7 +47,7 @@ class StillSpace:
         self.limbs = Limbs(np.array([-1]), np.zeros(1, np.bool_), np.zeros(1), leads, none, True)
 
     @cached_property
-    def surface_graph(self) -> csr_matrix:
+    def surface_graph(self) -> scipy.sparse.csr_matrix:
         """(V, V) lengths of the edges."""
         return length_graph(self.topology.edges, self.rest_vertices)
 
@@ -83,7 +82,9 @@ class StillSpace:
         """Return empty derivatives, (n, 0)."""
         return np.zeros((len(by_vertices), 0))
 
-    def mean_slopes(self, weights: csr_matrix) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    def mean_slopes(
+        self, weights: scipy.sparse.csr_matrix
+    ) -> Callable[[FloatArray, FloatArray], FloatArray]:
         """Return a function that gives empty derivatives."""
         n = 3 * weights.shape[0]
         return lambda _, by_vertices: np.zeros((n + len(by_vertices), 0))
@@ -258,10 +259,10 @@ class SceneSpace:
         return longest
 
     @cached_property
-    def surface_graph(self) -> csr_matrix:
+    def surface_graph(self) -> scipy.sparse.csr_matrix:
         """(V, V) lengths of the edges in the reference."""
         graphs = [member.place.scale * member.space.surface_graph for member in self.members]
-        return csr_matrix(sparse_block_diag(graphs, format="csr"))
+        return scipy.sparse.csr_matrix(scipy.sparse.block_diag(graphs, format="csr"))
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return a (D,) mask of body parts' codes; all of a body's codes if all parts are given."""
@@ -362,10 +363,12 @@ class SceneSpace:
             ]
         )
 
-    def mean_slopes(self, weights: csr_matrix) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    def mean_slopes(
+        self, weights: scipy.sparse.csr_matrix
+    ) -> Callable[[FloatArray, FloatArray], FloatArray]:
         """Prepare the derivatives of patches' means by the codes; see `PoseSpace.mean_slopes`."""
-        n, columns = weights.shape[0], csr_matrix(weights).tocsc()
-        own_weights = [csr_matrix(columns[:, rows]) for rows in self.vertices]
+        n, columns = weights.shape[0], scipy.sparse.csr_matrix(weights).tocsc()
+        own_weights = [scipy.sparse.csr_matrix(columns[:, rows]) for rows in self.vertices]
         prepared = [
             member.space.mean_slopes(own) if own.nnz else None
             for member, own in zip(self.members, own_weights, strict=True)

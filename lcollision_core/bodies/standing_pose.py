@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+import scipy
 
 from lcollision_core.bodies.skeletons import anatomy_of, axes_of, joint_roles, limb_children, rig_of
 from lcollision_core.files.character import Character, Rig
@@ -281,7 +281,7 @@ def _plain_pose(
             correction = least_turn(way, -up) @ corrections[-1]
         elif parent >= 0 and roles.roles[joint] in _AS_ON_AVERAGE:
             local = np.swapaxes(turns[:, parent], 1, 2) @ turns[:, joint]
-            usual = Rotation.from_matrix(local).mean().as_matrix()
+            usual = scipy.spatial.transform.Rotation.from_matrix(local).mean().as_matrix()
             correction = rested[parent] @ usual @ turns[frame, joint].T
         corrections[joint] = correction
         rested[joint] = correction @ turns[frame, joint]

@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+import scipy
 
 from lcollision_core.contact.arrays import ClearanceRule, Exclusions
 from lcollision_core.contact.kernels import find_rules
@@ -110,7 +110,7 @@ def _creases(
     reached = np.flatnonzero(np.isfinite(length))
     if not len(reached):
         return None
-    _, nearest = cKDTree(reference[reached]).query(reference)
+    _, nearest = scipy.spatial.cKDTree(reference[reached]).query(reference)
     places = np.array(joints).reshape(-1, 3)
     return Creases(reference, length[reached[nearest]], places, np.array(of_joints))
 

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
+import scipy
 
 from lcollision_core.contact.detector import CollisionDetector
 from lcollision_core.contact.exclusions import require_listable
@@ -109,12 +109,12 @@ def patches_about(
         return ()
     middles, near = _patches(detector, np.unique(patch_pairs), radius)
     of_first, of_second = near[patch_pairs[:, 0]], near[patch_pairs[:, 1]]
-    n_poses_of = sparse.csr_matrix(2 * (len(middles),), dtype=np.int32)
+    n_poses_of = scipy.sparse.csr_matrix(2 * (len(middles),), dtype=np.int32)
     ends = np.cumsum([len(pairs) for pairs in touching])
     for rows in np.split(places.ravel(), ends[:-1]):
         one_way = of_first[rows].T @ of_second[rows]
         n_poses_of += (one_way + one_way.T).astype(np.int32)
-    often = sparse.triu(n_poses_of).tocoo()
+    often = scipy.sparse.triu(n_poses_of).tocoo()
     is_frequent = often.data >= NEARLY_ALWAYS * len(touching)
     patches = np.stack([often.row, often.col], axis=1)
     if of_pieces:
@@ -153,7 +153,7 @@ def _of_touching_pieces(
 
 def _patches(
     detector: CollisionDetector, faces: npt.NDArray[np.int32], radius: float
-) -> tuple[npt.NDArray[np.int32], sparse.csr_matrix]:
+) -> tuple[npt.NDArray[np.int32], scipy.sparse.csr_matrix]:
     """Cover faces by n patches; return their middle faces, and (F, n) the faces in each."""
     surface = surface_of(detector.topology, detector.reference)
     require = partial(require_listable, rule="touching radius")
@@ -174,8 +174,8 @@ def _patches(
 
 
 def _covering(
-    of_first: sparse.csc_matrix,
-    of_second: sparse.csc_matrix,
+    of_first: scipy.sparse.csc_matrix,
+    of_second: scipy.sparse.csc_matrix,
     patches: npt.NDArray[np.integer],
     middles: npt.NDArray[np.int32],
 ) -> tuple[tuple[int, int], ...]:
@@ -201,7 +201,7 @@ def _covering(
 
 
 def _rows(
-    of_first: sparse.csc_matrix, i: int, of_second: sparse.csc_matrix, j: int
+    of_first: scipy.sparse.csc_matrix, i: int, of_second: scipy.sparse.csc_matrix, j: int
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
     """Return the non-zero rows of a column of each of two matrices."""
     return (

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
+import scipy
 
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.jobs import for_blocks
@@ -241,10 +241,12 @@ def _listed(
     return Lists(start, table.indices.astype(np.int32))
 
 
-def matrix_of(lists: Lists, n_columns: int) -> sparse.csr_matrix:
+def matrix_of(lists: Lists, n_columns: int) -> scipy.sparse.csr_matrix:
     """Return the bool matrix whose row i is true in the columns of list i."""
     ones = np.ones(len(lists.entry), dtype=np.bool_)
-    return sparse.csr_matrix((ones, lists.entry, lists.start), (len(lists.start) - 1, n_columns))
+    return scipy.sparse.csr_matrix(
+        (ones, lists.entry, lists.start), (len(lists.start) - 1, n_columns)
+    )
 
 
 def _starts(counts: npt.NDArray[np.integer]) -> LongArray:
@@ -256,7 +258,7 @@ def _table(
 ) -> Lists:
     """Return the columns of each row, ascending, each once."""
     ones = np.ones(len(rows), dtype=np.bool_)
-    table = sparse.csr_matrix((ones, (rows, columns)), shape=(n_rows, n_columns))
+    table = scipy.sparse.csr_matrix((ones, (rows, columns)), shape=(n_rows, n_columns))
     table.sum_duplicates()
     return Lists(table.indptr.astype(np.int64), table.indices.astype(np.int32))
 

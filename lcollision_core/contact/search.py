@@ -13,7 +13,7 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
+import scipy
 
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.contact.arrays import (
@@ -293,7 +293,9 @@ class _SymmetricLists(NamedTuple):
 
 def _both_ways(start: npt.NDArray[np.int64], entry: IntArray) -> _SymmetricLists:
     n = len(start) - 1
-    after = sparse.csr_matrix((np.ones(len(entry), dtype=np.bool_), entry, start), shape=(n, n))
+    after = scipy.sparse.csr_matrix(
+        (np.ones(len(entry), dtype=np.bool_), entry, start), shape=(n, n)
+    )
     before = after.T.tocsr()
     return _SymmetricLists(
         start, entry, before.indptr.astype(np.int64), before.indices.astype(np.int32)

@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.sparse import csgraph
-from scipy.spatial import cKDTree
+import scipy
 
 from lcollision_core.contact.detector import CollisionDetector
 from lcollision_core.errors import LCollisionError
@@ -179,7 +177,7 @@ def pinned(
     joined, loose, pins = clouds[0], clouds[1:], list[FloatArray]()
     balls = []
     while loose:
-        neighbours = [cKDTree(joined).query(cloud) for cloud in loose]
+        neighbours = [scipy.spatial.cKDTree(joined).query(cloud) for cloud in loose]
         nearest = min(range(len(loose)), key=lambda n: float(neighbours[n][0].min()))
         gaps, at = neighbours[nearest]
         end = int(gaps.argmin())
@@ -418,8 +416,8 @@ def _separated(faces: IndexArray) -> tuple[IndexArray, IndexArray, IndexArray]:
 
 
 def _components(one: IndexArray, two: IndexArray, size: int) -> tuple[int, IndexArray]:
-    graph = sparse.coo_matrix((np.ones(len(one)), (one, two)), (size, size))
-    count, label = csgraph.connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_matrix((np.ones(len(one)), (one, two)), (size, size))
+    count, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
     return int(count), label.astype(np.int64)
 
 

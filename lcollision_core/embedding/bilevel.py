@@ -9,8 +9,8 @@ from typing import Annotated, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from msgspec import Meta
-from scipy.special import ndtri
 
 from lcollision_core.acap.codec import BLOCK_POSES, AcapCodec
 from lcollision_core.acap.features import N_FEATURES, FeatureScaling
@@ -231,7 +231,7 @@ class PoseDraws:
         """Blend known poses and add normal noise of a random size: (n_poses, D), in the box."""
         blended = self.blends(n_poses, uniform)
         # Take the middle of one of 2**53 intervals: a 0 would become minus infinity.
-        noise = ndtri(uniform(blended.shape) + 2.0**-54)
+        noise = scipy.special.ndtri(uniform(blended.shape) + 2.0**-54)
         size = _NOISE * uniform((n_poses, 1)) * (self.high - self.low)
         noisy: FloatArray = np.clip(blended + size * noise, self.low, self.high)
         return noisy

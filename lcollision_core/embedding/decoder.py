@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
+import scipy
 
 from lcollision_core.acap.features import N_FEATURES, FeatureScaling
 from lcollision_core.compiled import compiled, compiled_part, compiled_sums, inlined
@@ -299,7 +299,7 @@ class AutoencoderWeights:
     ring_weight: Float32Array
     support: IntArray
 
-    def encode(self, features: Float32Array, ring: sparse.csr_matrix) -> Float32Array:
+    def encode(self, features: Float32Array, ring: scipy.sparse.csr_matrix) -> Float32Array:
         """Return the (B, m) codes of (B, n, 9) features; `ring` (V, V) averages over one-rings."""
         around = ring_mean(features, ring[self.support][:, self.support])
         hidden = np.tanh(features @ self.self_weight + around @ self.ring_weight)
@@ -309,7 +309,7 @@ class AutoencoderWeights:
         return codes
 
     def decoder_table(
-        self, ring: sparse.csr_matrix, dtype: npt.DTypeLike = np.float32
+        self, ring: scipy.sparse.csr_matrix, dtype: npt.DTypeLike = np.float32
     ) -> npt.NDArray[Any]:
         """Return the (m, 9 n) table of the decoder: decoding is tanh of the codes times it."""
         components = self.components.astype(dtype)
@@ -318,13 +318,13 @@ class AutoencoderWeights:
         return table.reshape(len(table), -1)
 
 
-def ring_average(topology: Topology) -> sparse.csr_matrix:
+def ring_average(topology: Topology) -> scipy.sparse.csr_matrix:
     """Return the (V, V) matrix that averages over each one-ring; an empty ring gives 0."""
     counts = np.maximum(np.diff(topology.adjacency.indptr), 1)
-    return sparse.csr_matrix(sparse.diags(1.0 / counts) @ topology.adjacency)
+    return scipy.sparse.csr_matrix(scipy.sparse.diags(1.0 / counts) @ topology.adjacency)
 
 
-def ring_mean(values: npt.NDArray[Any], ring: sparse.csr_matrix) -> npt.NDArray[Any]:
+def ring_mean(values: npt.NDArray[Any], ring: scipy.sparse.csr_matrix) -> npt.NDArray[Any]:
     """Average (m, n, 9) values over one-rings by the (n, n) matrix `ring`, in the values' dtype."""
     n_rows, n_vertices, width = values.shape
     columns = values.transpose(1, 0, 2).reshape(n_vertices, n_rows * width)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
+import scipy
 
 from lcollision_core.acap import codec, features
 from lcollision_core.embedding import decoder
@@ -160,7 +160,7 @@ class GpuDecoder:
         )
         size = len(codec.poisson.inverse_pivot)
         by_column = (codec.poisson.lower, codec.poisson.row, codec.poisson.column_start)
-        rows = sparse.csc_matrix(by_column, shape=(size, size)).tocsr()
+        rows = scipy.sparse.csc_matrix(by_column, shape=(size, size)).tocsr()
         rows.sort_indices()
         self._poisson = copied(codec.poisson)
         self._rows = tuple(map(cuda.to_device, (rows.indptr, rows.indices, rows.data)))

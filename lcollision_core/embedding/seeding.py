@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csgraph
-from scipy.spatial import cKDTree
+import scipy
 
 from lcollision_core.acap.features import N_FEATURES, N_ROTATION, component_bridges
 from lcollision_core.errors import PoseSetError, ShapeError
@@ -41,7 +40,7 @@ def bridged_edges(topology: Topology, rest_vertices: FloatArray) -> IntArray:
     _, component = topology.vertex_components
     alone = np.flatnonzero(np.bincount(component)[component] == 1)
     used = np.setdiff1d(np.arange(topology.n_vertices), alone)
-    _, nearest = cKDTree(rest_vertices[used]).query(rest_vertices[alone])
+    _, nearest = scipy.spatial.cKDTree(rest_vertices[used]).query(rest_vertices[alone])
     ties = np.stack([alone, used[nearest]], axis=1).astype(np.int32)
     return np.concatenate([topology.edges, component_bridges(topology, rest_vertices), ties])
 
@@ -171,12 +170,12 @@ def domain_distances(
         geodesic distance
     """
     graph = length_graph(bridged_edges(topology, rest_vertices), rest_vertices)
-    start = int(np.argmax(csgraph.dijkstra(graph, indices=0)))
-    largest = float(csgraph.dijkstra(graph, indices=start).max())
+    start = int(np.argmax(scipy.sparse.csgraph.dijkstra(graph, indices=0)))
+    largest = float(scipy.sparse.csgraph.dijkstra(graph, indices=start).max())
     distances = np.empty((int(domain_of.max()) + 1, topology.n_vertices))
     for domain, row in enumerate(distances):
         inside = np.flatnonzero(domain_of == domain)
-        row[:] = csgraph.dijkstra(graph, indices=inside, min_only=True)
+        row[:] = scipy.sparse.csgraph.dijkstra(graph, indices=inside, min_only=True)
     return distances / max(largest, 1e-12)
 
 
@@ -347,7 +346,7 @@ def _largest_patches(
     """Return the vertices of each domain's largest connected patch, none for an empty domain."""
     inside = edges[owner[edges[:, 0]] == owner[edges[:, 1]]]
     graph = edge_graph(inside, len(owner), np.ones(len(inside)))
-    _, patch = csgraph.connected_components(graph, directed=False)
+    _, patch = scipy.sparse.csgraph.connected_components(graph, directed=False)
     patches = []
     for domain in range(n_domains):
         owned = np.flatnonzero(owner == domain)
@@ -361,7 +360,7 @@ def _nearest_owned(
 ) -> npt.NDArray[np.intp]:
     """Return the nearest owned vertex of each vertex that is not owned."""
     graph = length_graph(bridged_edges(topology, rest_vertices), rest_vertices)
-    _, _, source = csgraph.dijkstra(
+    _, _, source = scipy.sparse.csgraph.dijkstra(
         graph, indices=np.flatnonzero(owned), min_only=True, return_predecessors=True
     )
     nearest: npt.NDArray[np.intp] = np.asarray(source)[~owned].astype(np.intp)

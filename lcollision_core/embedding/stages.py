@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 import torch
-from scipy import sparse
 from torch.autograd.function import once_differentiable
 
 from lcollision_core.acap.codec import AcapCodec
@@ -49,7 +49,7 @@ class _RingMean(torch.autograd.Function):
     """Differentiable `ring_mean`; torch's sparse product warns and depends on the thread count."""
 
     @staticmethod
-    def forward(ctx: Any, values: torch.Tensor, ring: sparse.csr_matrix) -> torch.Tensor:
+    def forward(ctx: Any, values: torch.Tensor, ring: scipy.sparse.csr_matrix) -> torch.Tensor:
         ctx.ring = ring
         return torch.from_numpy(ring_mean(values.detach().numpy(), ring))
 
@@ -59,7 +59,7 @@ class _RingMean(torch.autograd.Function):
         return torch.from_numpy(ring_mean(grad_mean.numpy(), ctx.ring.T)), None
 
 
-def differentiable_ring_mean(values: torch.Tensor, ring: sparse.csr_matrix) -> torch.Tensor:
+def differentiable_ring_mean(values: torch.Tensor, ring: scipy.sparse.csr_matrix) -> torch.Tensor:
     """Average (m, n, 9) values over the one-rings, differentiably; `ring` is (n, n)."""
     mean: torch.Tensor = _RingMean.apply(values, ring)  # type: ignore[no-untyped-call]
     return mean
@@ -80,7 +80,7 @@ class TiedAutoencoder(torch.nn.Module):
     shared over the vertices, as in the paper; there is no bias.
     """
 
-    def __init__(self, components: npt.NDArray[np.floating], ring: sparse.csr_matrix) -> None:
+    def __init__(self, components: npt.NDArray[np.floating], ring: scipy.sparse.csr_matrix) -> None:
         super().__init__()
         weights = torch.tensor(components, dtype=torch.get_default_dtype())
         width = weights.shape[2]

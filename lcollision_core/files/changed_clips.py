@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.character import Character, CharacterFile, Rig
@@ -140,10 +140,15 @@ def _change(file: CharacterFile, patch: GltfDocument, rig: Rig, change: ChangedC
             joint_turns = turns[rows, joint]
             if np.abs(joint_turns - np.eye(4)).max() <= _UNCHANGED:
                 continue
-            old = Rotation.from_quat(unit_quaternions(rotation.at(at)[:, 0]))
+            old = scipy.spatial.transform.Rotation.from_quat(
+                unit_quaternions(rotation.at(at)[:, 0])
+            )
             sizes = scale.at(at)[:, 0]
             turned = (
-                old * Rotation.from_matrix(_unscaled(joint_turns[:, :3, :3], sizes))
+                old
+                * scipy.spatial.transform.Rotation.from_matrix(
+                    _unscaled(joint_turns[:, :3, :3], sizes)
+                )
             ).as_quat()
             new_rotation = new_rotation.with_span(before, at, after, turned[:, None])
             if np.abs(joint_turns[:, :3, 3]).max() > _UNCHANGED:

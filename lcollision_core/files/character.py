@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csc_matrix, csr_matrix
+import scipy
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.gltf.schema import PARTS, GltfDocument, as_float, local_transform
@@ -165,10 +165,10 @@ class Shapes:
     at_rest: FloatArray
     mixes: tuple[FloatArray, ...]
     sources: npt.NDArray[np.int64]
-    deltas: csc_matrix
+    deltas: scipy.sparse.csc_matrix
 
     @cached_property
-    def by_row(self) -> csr_matrix:
+    def by_row(self) -> scipy.sparse.csr_matrix:
         """`deltas` in CSR form."""
         return self.deltas.tocsr()
 

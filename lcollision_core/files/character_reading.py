@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csc_matrix
-from scipy.spatial import cKDTree
+import scipy
 
 from lcollision_core.errors import MeshFileError, ShapeError
 from lcollision_core.files.character import (
@@ -145,7 +144,7 @@ def _joined(
         used = topology.used_vertices
         others, inside_rows = used[~inside[used]], used[inside[used]]
         if len(inside_rows) and len(others):
-            away, _ = cKDTree(rest_vertices[inside_rows]).query(rest_vertices[others])
+            away, _ = scipy.spatial.cKDTree(rest_vertices[inside_rows]).query(rest_vertices[others])
             beyond = others[away <= min(near, _NEARLY * away.min())]
     joined: npt.NDArray[np.int64] = np.bincount(led_by[beyond], minlength=n_joints)
     return joined
@@ -435,7 +434,9 @@ def _shapes(scene: Scene, mesh: JoinedMesh, weights: FloatArray) -> Shapes | Non
     parts = (
         np.concatenate([columns[number][place] for number in shape_numbers]) for place in (1, 0)
     )
-    deltas = csc_matrix((*parts, ends), shape=(3 * int(weighing.sum()), len(shape_numbers)))
+    deltas = scipy.sparse.csc_matrix(
+        (*parts, ends), shape=(3 * int(weighing.sum()), len(shape_numbers))
+    )
     names = tuple(names[number] for number in shape_numbers)
     mixes, sources = [], np.full((len(names), 2), -1)
     weights = np.zeros(len(names))

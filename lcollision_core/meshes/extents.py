@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+import scipy
 
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, Topology
@@ -167,9 +167,9 @@ def _stands(pose: FloatArray, axis: int) -> float:
     extent = max(float(level.max()), np.finfo(np.float64).tiny)
     flat = np.delete(pose, axis, axis=1)
     try:
-        hull = ConvexHull(flat[level <= _SUPPORT * extent])
-    except (QhullError, ValueError):  # too few points, or all on a line: no stable support
-        return 0.0
+        hull = scipy.spatial.ConvexHull(flat[level <= _SUPPORT * extent])
+    except (scipy.spatial.QhullError, ValueError):
+        return 0.0  # too few points, or all on a line: no stable support
     middle = flat.mean(axis=0)
     if (hull.equations[:, :2] @ middle + hull.equations[:, 2]).max() > 0.0:
         return 0.0
@@ -184,7 +184,7 @@ def _side(reference: FloatArray) -> int | None:
     extent = float(np.ptp(reference, axis=0).max())
     if extent == 0.0:
         return None
-    tree = cKDTree(reference)
+    tree = scipy.spatial.cKDTree(reference)
     distances = []
     for axis in range(3):
         image = reference.copy()

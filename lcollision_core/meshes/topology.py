@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.sparse import csgraph
+import scipy
 
 from lcollision_core.errors import PoseSetError, ShapeError
 
@@ -38,10 +37,10 @@ def array_of(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
         ) from error
 
 
-def edge_graph(edges: IntArray, n_vertices: int, weights: FloatArray) -> sparse.csr_matrix:
+def edge_graph(edges: IntArray, n_vertices: int, weights: FloatArray) -> scipy.sparse.csr_matrix:
     """Return the symmetric (V, V) matrix of (E,) weights of (E, 2) edges, in sorted CSR form."""
     i, j = edges.T
-    matrix = sparse.coo_matrix(
+    matrix = scipy.sparse.coo_matrix(
         (np.tile(weights, 2), (np.concatenate([i, j]), np.concatenate([j, i]))),
         shape=(n_vertices, n_vertices),
     ).tocsr()
@@ -49,7 +48,7 @@ def edge_graph(edges: IntArray, n_vertices: int, weights: FloatArray) -> sparse.
     return matrix
 
 
-def length_graph(edges: IntArray, vertices: FloatArray) -> sparse.csr_matrix:
+def length_graph(edges: IntArray, vertices: FloatArray) -> scipy.sparse.csr_matrix:
     """Return the symmetric (V, V) matrix of the lengths of (E, 2) edges between (V, 3) vertices."""
     # csgraph treats a stored 0 as no edge.
     lengths = np.maximum(_lengths(edges, vertices), _LEAST_LENGTH)
@@ -182,8 +181,8 @@ class Topology:
         # Corners of neighbouring faces at the same end of their common edge are in one fan.
         first, second = meeting_corners(self.faces)
         links = np.ones(first.size), (first.ravel(), second.ravel())
-        graph = sparse.coo_matrix(links, 2 * (self.faces.size,))
-        n_fans, fan = csgraph.connected_components(graph, directed=False)
+        graph = scipy.sparse.coo_matrix(links, 2 * (self.faces.size,))
+        n_fans, fan = scipy.sparse.csgraph.connected_components(graph, directed=False)
         vertex = np.empty(n_fans, dtype=np.int64)
         vertex[fan] = self.faces.ravel()
         return np.flatnonzero(np.bincount(vertex) > 1).astype(np.int32)
@@ -194,7 +193,7 @@ class Topology:
         return self._edges_and_counts[2]
 
     @cached_property
-    def adjacency(self) -> sparse.csr_matrix:
+    def adjacency(self) -> scipy.sparse.csr_matrix:
         """(V, V) symmetric 0/1 matrix, CSR with sorted indices: the one-rings."""
         return edge_graph(self.edges, self.n_vertices, np.ones(len(self.edges)))
 
@@ -204,7 +203,7 @@ class Topology:
 
         A vertex in no face is a component of its own.
         """
-        count, labels = csgraph.connected_components(self.adjacency, directed=False)
+        count, labels = scipy.sparse.csgraph.connected_components(self.adjacency, directed=False)
         return int(count), np.asarray(labels, dtype=np.int32)
 
     @cached_property

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_factor, cho_solve
+import scipy
 
 from lcollision_core.jobs import UNWATCHED
 from lcollision_core.meshes.topology import FloatArray
@@ -160,7 +160,7 @@ def least_corrections(
     solved = np.zeros((n_equal, 1 + len(bounds) - n_equal))
     if n_equal:
         known = np.column_stack([bounds[equal], gram[equal, rest]])
-        solved = cho_solve(cho_factor(gram[equal, equal]), known)
+        solved = scipy.linalg.cho_solve(scipy.linalg.cho_factor(gram[equal, equal]), known)
     mixed = gram[rest, equal]
     multipliers = _solve_lcp(
         gram[rest, rest] - mixed @ solved[:, 1:], bounds[rest] - mixed @ solved[:, 0]
@@ -191,8 +191,10 @@ def _solve_lcp(gram: FloatArray, bounds: FloatArray) -> FloatArray | None:
         pressing = np.flatnonzero(presses)
         multipliers = np.zeros(len(bounds))
         if len(pressing):
-            factor = cho_factor(gram[np.ix_(pressing, pressing)], lower=True, overwrite_a=True)
-            multipliers[pressing] = cho_solve(factor, -bounds[pressing])
+            factor = scipy.linalg.cho_factor(
+                gram[np.ix_(pressing, pressing)], lower=True, overwrite_a=True
+            )
+            multipliers[pressing] = scipy.linalg.cho_solve(factor, -bounds[pressing])
         left = bounds + gram[:, pressing] @ multipliers[pressing]
         is_wrong = np.where(presses, multipliers < 0.0, left < -_TOLERANCE)
         n_wrong = int(np.count_nonzero(is_wrong))

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csgraph, csr_matrix
+import scipy
 
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.contact import SelfCollisions
@@ -193,7 +193,9 @@ def make_grip(space: PoseSpace, vertex: int, radius: float = GRIP_RADIUS) -> Gri
             "the vertex to take hold of", f"0 to {n_vertices - 1}", vertex
         )
     radius = float(np.clip(radius, LEAST_RADIUS, LARGEST_RADIUS))
-    along = csgraph.dijkstra(space.surface_graph, directed=False, indices=vertex, limit=radius)
+    along = scipy.sparse.csgraph.dijkstra(
+        space.surface_graph, directed=False, indices=vertex, limit=radius
+    )
     # A vertex at the rim has weight 0.
     weights = np.clip(1.0 - (along / radius) ** 2, 0.0, None) ** 2
     inside = np.flatnonzero(weights > 0.0)
@@ -387,7 +389,7 @@ def _mean_slopes(space: PoseSpace, patches: Sequence[Grip]) -> MeanSlopes:
     vertices = np.concatenate([patch.vertices for patch in patches])
     ends = np.cumsum([0, *(len(patch.vertices) for patch in patches)])
     shape = (len(patches), space.topology.n_vertices)
-    return space.mean_slopes(csr_matrix((weights, vertices, ends), shape=shape))
+    return space.mean_slopes(scipy.sparse.csr_matrix((weights, vertices, ends), shape=shape))
 
 
 def _drifts(pins: Sequence[HeldPatch], pose: Decoded) -> list[FloatArray]:

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csgraph, csr_matrix
+import scipy
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.meshes.limbs import Limbs, far_apart
@@ -150,7 +150,7 @@ class PoseSpace(Protocol):
         """(E,) float64 array, the longest length of each edge in plausible poses."""
 
     @property
-    def surface_graph(self) -> csr_matrix:
+    def surface_graph(self) -> scipy.sparse.csr_matrix:
         """(V, V) lengths of the edges on the reference, for distances along the surface."""
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
@@ -194,7 +194,7 @@ class PoseSpace(Protocol):
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
 
-    def mean_slopes(self, weights: csr_matrix) -> MeanSlopes:
+    def mean_slopes(self, weights: scipy.sparse.csr_matrix) -> MeanSlopes:
         """Prepare the derivatives of patches' means by the codes, for the many poses of a drag.
 
         Parameters
@@ -281,7 +281,7 @@ class LatentPoseSpace:
         return longest
 
     @cached_property
-    def surface_graph(self) -> csr_matrix:
+    def surface_graph(self) -> scipy.sparse.csr_matrix:
         """(V, V) lengths of the edges on the reference."""
         return length_graph(self.topology.edges, self.rest_vertices)
 
@@ -297,7 +297,7 @@ class LatentPoseSpace:
         np.add.at(borders, (domains[:, 0], domains[:, 1]), 1.0)
         np.fill_diagonal(borders, 0.0)
         borders += borders.T
-        steps = csgraph.shortest_path(borders > 0.0, unweighted=True)
+        steps = scipy.sparse.csgraph.shortest_path(borders > 0.0, unweighted=True)
         root = int(np.where(np.isfinite(steps), steps, self.n_domains).sum(axis=1).argmin())
         nearer = steps[root][None, :] < steps[root][:, None]
         parents = np.where(nearer, borders, -1.0).argmax(axis=1)
@@ -371,7 +371,7 @@ class LatentPoseSpace:
         by_features = self.embedding.codec.decode_vjp(features[None], by_vertices, n_threads=1)
         return self.embedding.decoder.pull_back(codes, by_features)
 
-    def mean_slopes(self, weights: csr_matrix) -> MeanSlopes:
+    def mean_slopes(self, weights: scipy.sparse.csr_matrix) -> MeanSlopes:
         """Solve once for the patches' means; see `PoseSpace.mean_slopes`."""
         codec, decoder = self.embedding.codec, self.embedding.decoder
         by_gradients = codec.means_by_gradients(weights)

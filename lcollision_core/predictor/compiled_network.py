@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.sparse import csgraph
+import scipy
 
 from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.embedding import Embedding
@@ -75,19 +74,21 @@ def neighbour_order(positions: FloatArray, block: int) -> npt.NDArray[np.int32]:
     return np.append(order, np.repeat(order[-1], -len(order) % block)).astype(np.int32)
 
 
-def skin_graph(embedding: Embedding) -> sparse.csr_matrix:
+def skin_graph(embedding: Embedding) -> scipy.sparse.csr_matrix:
     """Return the (V, V) lengths of the reference's edges, in normalised length."""
     return length_graph(embedding.topology.edges, embedding.rest_vertices)
 
 
 def skin_distances(
-    graph: sparse.csr_matrix, vertex: npt.NDArray[np.integer], limit: float = np.inf
+    graph: scipy.sparse.csr_matrix, vertex: npt.NDArray[np.integer], limit: float = np.inf
 ) -> FloatArray:
     """Return (n, V) normalised lengths of the shortest edge paths from n vertices.
 
     They are infinite between components, and beyond the limit.
     """
-    distance: FloatArray = csgraph.dijkstra(graph, directed=False, indices=vertex, limit=limit)
+    distance: FloatArray = scipy.sparse.csgraph.dijkstra(
+        graph, directed=False, indices=vertex, limit=limit
+    )
     return distance
 
 

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import expit
+import scipy
 
 from lcollision_core.errors import LabelStoreError
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
@@ -67,7 +67,7 @@ class ScoredRows:
     @cached_property
     def probability(self) -> FloatArray:
         """(B,) the predicted probability of a collision."""
-        probability: FloatArray = expit(self.logit)
+        probability: FloatArray = scipy.special.expit(self.logit)
         return probability
 
     def called(self, threshold: float = 0.5) -> npt.NDArray[np.bool_]:

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from msgspec import Meta
-from scipy.special import betaincinv, ndtri
 
 from lcollision_core.meshes.topology import FloatArray
 
@@ -77,7 +77,7 @@ def _most_errors(n_samples: int, bound: float) -> int | None:
     confirmed, refuted = -1, int(bound * n_samples) + 1
     while refuted - confirmed > 1:
         middle = (confirmed + refuted) // 2
-        if betaincinv(middle + 1, max(n_samples - middle, 1), CONFIDENCE) <= bound:
+        if scipy.special.betaincinv(middle + 1, max(n_samples - middle, 1), CONFIDENCE) <= bound:
             confirmed = middle
         else:
             refuted = middle
@@ -291,8 +291,8 @@ def interval(count: int, total: int) -> tuple[float, float] | None:
     if not total:
         return None
     tail = 0.5 * (1.0 - CONFIDENCE)
-    low = betaincinv(count, total - count + 1, tail) if count else 0.0
-    high = betaincinv(count + 1, total - count, 1.0 - tail) if count < total else 1.0
+    low = scipy.special.betaincinv(count, total - count + 1, tail) if count else 0.0
+    high = scipy.special.betaincinv(count + 1, total - count, 1.0 - tail) if count < total else 1.0
     return float(low), float(high)
 
 
@@ -304,7 +304,7 @@ def auc_interval(auc: float, n_positive: int, n_negative: int) -> tuple[float, f
         + (n_positive - 1) * (of_positive - auc**2)
         + (n_negative - 1) * (of_negative - auc**2)
     ) / (n_positive * n_negative)
-    margin = float(ndtri(0.5 * (1.0 + CONFIDENCE)) * np.sqrt(max(variance, 0.0)))
+    margin = float(scipy.special.ndtri(0.5 * (1.0 + CONFIDENCE)) * np.sqrt(max(variance, 0.0)))
     return max(0.0, auc - margin), min(1.0, auc + margin)
 
 

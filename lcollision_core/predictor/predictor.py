@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from msgspec import Meta
-from scipy.special import expit
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
@@ -184,7 +184,7 @@ class CollisionPredictor:
         n_domains = self.embedding.n_domains
         if domain_energy.shape[1] != n_domains:
             domain_energy = np.repeat(domain_energy / n_domains, n_domains, axis=1)
-        results = (domain_energy, domain_energy.sum(axis=1), logit, expit(logit))
+        results = (domain_energy, domain_energy.sum(axis=1), logit, scipy.special.expit(logit))
         for array in results:
             array.flags.writeable = False
         return Prediction(*results)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+import scipy
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.mesh.text import number_rows
@@ -101,7 +101,9 @@ class Bvh:
                 angles = np.radians(self.numbers[:, columns])
                 # SciPy takes the angles of a single axis as a 1D array.
                 given = angles if len(axes) > 1 else angles[:, 0]
-                turned[:, joint] = Rotation.from_euler(axes, given).as_matrix()
+                turned[:, joint] = scipy.spatial.transform.Rotation.from_euler(
+                    axes, given
+                ).as_matrix()
         return turned
 
     def positions(self) -> FloatArray:
@@ -320,7 +322,9 @@ def angles_near(turns: FloatArray, axes: str, before: FloatArray) -> FloatArray:
     with warnings.catch_warnings():
         # At gimbal lock one angle is free, and any will do.
         warnings.simplefilter("ignore", UserWarning)
-        first, middle, last = Rotation.from_matrix(turns).as_euler(order, degrees=True).T
+        first, middle, last = (
+            scipy.spatial.transform.Rotation.from_matrix(turns).as_euler(order, degrees=True).T
+        )
     ways = [(first, middle, last), (first + 180.0, 180.0 - middle, last + 180.0)]
     tried = np.array(ways).transpose(0, 2, 1)[:, :, : len(axes)]
     tried -= 360.0 * np.round((tried - before) / 360.0)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+import scipy
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.motion.skeleton import (
@@ -208,7 +208,9 @@ def _joints_of_vectors(vectors: FloatArray) -> FloatArray:
     positions of the other 21 joints in that frame, relative to the root along x and z.
     """
     half = np.concatenate([[0.0], np.cumsum(vectors[:-1, 0])])
-    turns = Rotation.from_rotvec(np.multiply.outer(-2.0 * half, [0.0, 1.0, 0.0]))
+    turns = scipy.spatial.transform.Rotation.from_rotvec(
+        np.multiply.outer(-2.0 * half, [0.0, 1.0, 0.0])
+    )
     steps = np.zeros((len(vectors), 3))
     steps[1:, [0, 2]] = vectors[:-1, 1:3]
     roots = np.cumsum(turns.apply(steps), axis=0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+import scipy
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.scene.joined import sample_clip
@@ -234,7 +234,7 @@ def nearest_axes(
     ----------
     one, other : if given, the rotation must take the first axis to the second
     """
-    quarters = Rotation.create_group("O").as_matrix().round()
+    quarters = scipy.spatial.transform.Rotation.create_group("O").as_matrix().round()
     if one is not None and other is not None:
         quarters = quarters[(quarters @ one) @ other > _SAME_AXIS]
     nearest: FloatArray = quarters[np.einsum("qij,nij->q", quarters, rotations).argmax()]

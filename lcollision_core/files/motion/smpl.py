@@ -15,14 +15,13 @@ from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array, csc_array, csr_array
-from scipy.spatial.transform import Rotation
+import scipy
 
 from lcollision_core.bundled import bundled_table
 from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.files.motion.skeleton import SkeletonMotion
 from lcollision_core.files.safe import ZIP_DAMAGE, read_npz
-from lcollision_core.files.scene.transforms import nearest_winding
+from lcollision_core.files.scene.transforms import from_rotation_vectors, nearest_winding
 from lcollision_core.files.table import SMPL_SUFFIX
 from lcollision_core.meshes.topology import FloatArray, Topology
 
@@ -102,7 +101,7 @@ class SmplModel:
     template: FloatArray
     shape_directions: FloatArray
     pose_directions: npt.NDArray[np.float32]
-    regressor: csr_array
+    regressor: scipy.sparse.csr_array
     weights: FloatArray
     hands: Mapping[str, tuple[FloatArray, FloatArray]]
 
@@ -223,10 +222,12 @@ def _model(
     )
 
 
-def _regressor(arrays: dict[str, npt.NDArray[Any]], n_joints: int, n: int) -> csr_array:
+def _regressor(
+    arrays: dict[str, npt.NDArray[Any]], n_joints: int, n: int
+) -> scipy.sparse.csr_array:
     """Return the (J, V) matrix, which is stored densely or in CSR, CSC or COO form."""
     if _REGRESSOR in arrays:
-        return csr_array(_floats(arrays, _REGRESSOR, (n_joints, n)))
+        return scipy.sparse.csr_array(_floats(arrays, _REGRESSOR, (n_joints, n)))
     if f"{_REGRESSOR}_data" not in arrays:
         raise _missing(_REGRESSOR)
     data = _floats(arrays, f"{_REGRESSOR}_data", (None,))
@@ -241,9 +242,9 @@ def _regressor(arrays: dict[str, npt.NDArray[Any]], n_joints: int, n: int) -> cs
     try:
         if f"{_REGRESSOR}_row" in arrays:
             pair = numbers("row", len(data)), numbers("col", len(data))
-            return coo_array((data, pair), shape=shape).tocsr()
+            return scipy.sparse.coo_array((data, pair), shape=shape).tocsr()
         starts = numbers("indptr")
-        kind = csr_array if len(starts) == n_joints + 1 else csc_array
+        kind = scipy.sparse.csr_array if len(starts) == n_joints + 1 else scipy.sparse.csc_array
         matrix = kind((data, numbers("indices", len(data)), starts), shape=shape)
         matrix.check_format()
         return matrix.tocsr()
@@ -618,7 +619,9 @@ def axes_of_smpl(motion: SmplMotion) -> FloatArray:
 
     Up is y or z, whichever the body mainly stands along.
     """
-    up = Rotation.from_rotvec(motion.turns[:, motion.names.index("pelvis")]).apply([0.0, 1.0, 0.0])
+    up = scipy.spatial.transform.Rotation.from_rotvec(
+        motion.turns[:, motion.names.index("pelvis")]
+    ).apply([0.0, 1.0, 0.0])
     _, y, z = up.mean(axis=0)
     return _FROM_Z_UP if z > y else np.eye(3)
 
@@ -645,7 +648,7 @@ def skeleton_of_smpl(motion: SmplMotion, nominal_rate: float) -> SkeletonMotion:
     offsets = np.array([ways[name][1] for name in order])
     frame, n_frames = axes_of_smpl(motion), len(motion)
     joint_turns = motion.turns[:, [numbers[name] for name in order]]
-    turns = Rotation.from_rotvec(joint_turns.reshape(-1, 3)).as_matrix()
+    turns = from_rotation_vectors(joint_turns.reshape(-1, 3))
     turns = turns.reshape(n_frames, len(order), 3, 3)
     turns[:, 0] = frame @ turns[:, 0]
     places = np.tile(offsets, (n_frames, 1, 1))

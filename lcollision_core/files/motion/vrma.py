@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from scipy.spatial.transform import Rotation
+import scipy
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.gltf.read import human_bones, read_nodes
@@ -102,7 +102,7 @@ def vrma_bytes(
     animation: dict[str, Any] = {"channels": [], "samplers": []}
     file.add_channel(animation, at, 0, "translation", hips)
     for number in range(len(names)):
-        turned = Rotation.from_matrix(turns[:, number]).as_quat()
+        turned = scipy.spatial.transform.Rotation.from_matrix(turns[:, number]).as_quat()
         # Make interpolation between keys take the shorter arc.
         turned *= signs_on_one_side(turned)[:, None]
         file.add_channel(animation, at, number, "rotation", turned)

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
+import scipy
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.mesh.polygons import are_of_same_polygons
@@ -124,14 +124,14 @@ class JoinedMesh:
         return result
 
     @cached_property
-    def _blend(self) -> sparse.csr_matrix:
+    def _blend(self) -> scipy.sparse.csr_matrix:
         """Return the weights as a (V, B) matrix."""
         n_vertices = self.topology.n_vertices
         rows = np.repeat(np.arange(n_vertices), self.bone_of.shape[1])
         entries = (self.weights.reshape(-1), (rows, self.bone_of.reshape(-1)))
-        return sparse.csr_matrix(entries, (n_vertices, len(self.bones)))
+        return scipy.sparse.csr_matrix(entries, (n_vertices, len(self.bones)))
 
-    def _blended(self, blend: sparse.csr_matrix, transforms: FloatArray) -> FloatArray:
+    def _blended(self, blend: scipy.sparse.csr_matrix, transforms: FloatArray) -> FloatArray:
         """Return the (V, 3, 4) affine maps of the vertices, for (nodes, 4, 4) transforms."""
         turns = transforms[self.bones] @ self.bind
         blended = (blend @ turns[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 from lcollision_core.meshes.topology import FloatArray
 
@@ -49,20 +50,30 @@ def unit_quaternions(rotation: FloatArray) -> FloatArray:
     return np.where(length > 0.0, rotation / np.where(length > 0.0, length, 1.0), identity)
 
 
+def from_rotation_vectors(vectors: npt.ArrayLike) -> FloatArray:
+    """Return the rotation matrices (..., 3, 3) of (..., 3) rotation vectors in radians."""
+    matrices: FloatArray = scipy.spatial.transform.Rotation.from_rotvec(vectors).as_matrix()
+    return matrices
+
+
+def rotation_vectors(matrices: FloatArray) -> FloatArray:
+    """Return the (..., 3) rotation vectors in radians of (..., 3, 3) rotation matrices."""
+    vectors: FloatArray = scipy.spatial.transform.Rotation.from_matrix(matrices).as_rotvec()
+    return vectors
+
+
 def decompose(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the translation, rotation (x, y, z, w) and scale of (..., 4, 4) affine matrices.
 
     A reflection goes to the scale of x, shear is lost, and a matrix with zero scale along an axis
     has no rotation.
     """
-    from scipy.spatial.transform import Rotation
-
     linear = matrix[..., :3, :3]
     scale = np.linalg.norm(linear, axis=-2)
     scale[..., 0] *= np.where(np.linalg.det(linear) < 0.0, -1.0, 1.0)
     is_flat = ~scale.all(axis=-1)[..., None, None]
     turns = np.where(is_flat, np.eye(3), linear / np.where(is_flat, 1.0, scale[..., None, :]))
-    rotation = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_quat()
+    rotation = scipy.spatial.transform.Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_quat()
     return matrix[..., :3, 3].copy(), rotation.reshape(*scale.shape[:-1], 4), scale
 
 

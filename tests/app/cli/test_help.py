@@ -53,6 +53,15 @@ def test_contact_and_meshes_load_neither_numba_nor_torch_nor_a_front_end() -> No
     assert loaded & {"numba", "torch", "anny", "vtkmodules", "pyvista", "PySide6"} == set()
 
 
+def test_info_of_a_model_loads_neither_a_compiler_nor_a_part_of_scipy() -> None:
+    loaded = _loaded_modules(
+        "from app.cli.main import app\napp(['info', 'body'], standalone_mode=False)"
+    )
+    assert "lcollision_core.bodies" in loaded
+    parts = {"scipy.sparse", "scipy.spatial", "scipy.linalg", "scipy.special"}
+    assert loaded & (parts | HEAVY - {"numpy", "scipy"}) == set()
+
+
 def test_the_page_of_commands_is_what_help_says() -> None:
     """To regenerate the page: python -m tests.app.cli.commands_page > docs/commands.md."""
     root = Path(__file__).parents[3]
