@@ -359,13 +359,16 @@ class Ladder:
         return None
 
     def _why_not(self) -> str:
-        if len(self.free_latents) == 0:
+        """Describe what prevents a free pose; advise only what makes a known pose free."""
+        known, check, movable = self.free_latents, self.check, self.problem.movable
+        if len(known) == 0:
             return "no collision-free pose is known to fall back to, so the pose still collides"
-        if self.problem.movable.all():
-            if self.check.clearance > 0.0:
-                return "no pose with this clearance was found; choose a smaller one"
-            return "no pose without collisions was found"
-        return "no free pose was found that keeps the locked body parts; unlock one"
+        kept = np.where(movable, known, self.problem.target)
+        if check.clearance > 0.0 and check.with_clearance(0.0).are_free(kept).any():
+            return "no pose with this clearance was found; choose a smaller one"
+        if not movable.all() and check.are_free(known).any():
+            return "no free pose was found that keeps the locked body parts; unlock one"
+        return "no pose without collisions was found"
 
     def _result(
         self,

@@ -211,12 +211,31 @@ def test_no_way_out_is_a_statement(tube_model: LearnedBody, deep: FloatArray) ->
     )
 
 
-def test_that_nothing_was_found_is_said_without_speaking_of_known_free_poses(
-    tube_model: LearnedBody, deep: FloatArray
+@pytest.mark.parametrize(
+    ("options", "is_free", "note"),
+    [
+        ({}, False, "no pose without collisions was found"),
+        ({"clearance": 0.3}, False, "no pose without collisions was found"),
+        ({"clearance": 0.3}, True, "no pose with this clearance was found; choose a smaller one"),
+        ({"locked_domains": frozenset({1})}, False, "no pose without collisions was found"),
+    ],
+)
+def test_advice_is_given_only_where_it_makes_a_known_pose_free(
+    tube_model: LearnedBody,
+    check: ExactCheck,
+    deep: FloatArray,
+    free_latents: FloatArray,
+    options: dict,
+    is_free: bool,
+    note: str,
 ) -> None:
-    result = resolver_of(tube_model, useless(deep), deep[None]).resolve(deep)
+    is_near = ~check.with_clearance(0.3).are_free(free_latents)
+    known = free_latents[is_near] if is_free else deep[None]
+    assert len(known)
+    resolver = resolver_of(tube_model, useless(deep), known)
+    result = resolver.resolve(deep, replace(FAR, time_budget=1e-9, **options))
     assert result.exactly_free is False
-    assert result.note == "no pose without collisions was found"
+    assert result.note == note
 
 
 @pytest.mark.parametrize("solver", [Solver.SQP, Solver.SLSQP])
