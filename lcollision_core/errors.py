@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copyreg
+from collections.abc import Iterable
 from typing import Any, Final, Self
 
 
@@ -15,7 +16,7 @@ class LCollisionError(Exception):
     Parameters
     ----------
     what : the problem with `where`, such as "cannot be read"
-    next_step : advice for the user, such as "export the mesh again"; may be empty
+    next_step : advice for the user, such as "export it again"; may be empty
     where : the file, pose or option concerned, such as "pose 12 (mesh012.obj)"
     expected, got : the required value and the actual one
 
@@ -96,6 +97,13 @@ class LCollisionError(Exception):
     def __reduce__(self) -> tuple[Any, ...]:
         # By default, pickling restores an exception from `args`, which lacks the fields.
         return copyreg.__newobj__, (type(self), self.what), self.__dict__  # type: ignore[attr-defined]
+
+
+def listed(names: Iterable[object], most: int = 8) -> str:
+    """List names in a sentence, at most so many, as in "hat, belt and 3 more"."""
+    texts = [*map(str, names)]
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return ", ".join(texts[:most]) + more
 
 
 class ShapeError(LCollisionError, ValueError):

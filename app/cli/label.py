@@ -25,7 +25,7 @@ from app.cli.evaluate import open_store
 from app.cli.models import measured_model, measured_model_sentence
 from app.cli.shared_options import DeviceOption, ModelArgument, ThreadsOption
 from lcollision_core.devices import Device, choose_device
-from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError
+from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError, listed
 from lcollision_core.options import SampleDistribution
 from lcollision_core.tasks.words import counted
 
@@ -161,9 +161,8 @@ def _check(model: LearnedBody, path: Path, as_json: bool) -> None:
             }
         )
     elif damaged:
-        listed = ", ".join(f"{rows[0]} to {rows[-1]}" for rows in damaged[:_LISTED])
-        more = f" and {len(damaged) - _LISTED} more" if damaged[_LISTED:] else ""
-        tell(f"{path}: damaged, rows {listed}{more}; {store.repair_advice}")
+        rows_text = listed((f"{rows[0]} to {rows[-1]}" for rows in damaged), _LISTED)
+        tell(f"{path}: damaged, rows {rows_text}; {store.repair_advice}")
     else:
         tell(f"{path}: intact, {counted(n_sound, 'row')} of {model.name}")
     if damaged:

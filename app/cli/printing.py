@@ -10,7 +10,7 @@ import typer
 from app.cli.console import ExitStatus, JsonOption, cancellable_bar, print_json, tell
 from app.cli.options import takes_options
 from app.cli.shared_options import ModelArgument, ScaleOption
-from lcollision_core.errors import LCollisionError
+from lcollision_core.errors import LCollisionError, listed
 from lcollision_core.options import NO_SCENE, PrintOptions, RuleOptions
 from lcollision_core.tasks.words import counted, printed_text
 
@@ -66,10 +66,10 @@ def print_figure(
             raise typer.Exit(ExitStatus.BAD_INPUT)
         matching = [given_pose.pose for given_pose in given if name in (None, given_pose.pose.name)]
         if len(matching) != 1:
-            names = ", ".join(given_pose.pose.name for given_pose in given[:8])
+            poses = counted(len(matching), "pose") if matching else "no pose"
             raise LCollisionError(
-                f"has {counted(len(matching), 'pose')}{f' named {name!r}' if name else ''}",
-                f"name one by --pose: {names}{' ...' if len(given) > 8 else ''}",
+                f"has {poses}{'' if name is None else f' named {name!r}'}",
+                f"name one by --pose: {listed(item.pose.name for item in given)}",
                 where=pose,
             )
         figure = print_pose(model, matching[0], output, options, job)

@@ -35,7 +35,7 @@ from app.cli.shared_options import (
     touch_entries,
 )
 from lcollision_core.devices import Device, choose_device
-from lcollision_core.errors import LCollisionError
+from lcollision_core.errors import LCollisionError, listed
 from lcollision_core.jobs import Job
 from lcollision_core.options import (
     ExportRequest,
@@ -394,7 +394,7 @@ def _domain(model: Body, name: str) -> int:
         return int(name) - 1
     raise LCollisionError(
         f"{model.name} has no domain {name!r}",
-        f"its domains are {', '.join(model.domain_names)}, or 1 to {len(names)}",
+        f"its domains are {listed(model.domain_names)}, or 1 to {len(names)}",
     )
 
 

@@ -27,7 +27,7 @@ from lcollision_core.bodies.retargeting import (
 )
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
-from lcollision_core.errors import LCollisionError, MeshFileError
+from lcollision_core.errors import LCollisionError, MeshFileError, listed
 from lcollision_core.files import (
     Character,
     FileStamp,
@@ -236,9 +236,7 @@ def _pairs(space: RigPoseSpace, motion: SmplMotion) -> list[tuple[int, int]]:
 
 
 def _listed(names: Sequence[str]) -> str:
-    plain = [name.replace("_", " ") for name in names]
-    more = f" and {len(plain) - _NAMED} more joints" if len(plain) > _NAMED else ""
-    return ", ".join(plain[:_NAMED]) + more
+    return listed((name.replace("_", " ") for name in names), _NAMED)
 
 
 _HIDDEN = 1e-3

@@ -37,7 +37,7 @@ from lcollision_core.bodies.standing_pose import (
     stick_figure,
     with_standing_rest,
 )
-from lcollision_core.errors import MeshFileError
+from lcollision_core.errors import MeshFileError, listed
 from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.character_reading import is_gltf
 from lcollision_core.files.gltf.read import human_bones
@@ -541,9 +541,8 @@ def _bones(character: Character, space: RigPoseSpace) -> tuple[bool, dict[str, i
         bones = _recognised(space)
     missing = [name for name in _NEEDED if name not in bones]
     if missing:
-        listed = ", ".join(missing[:4]) + (" and others" if len(missing) > 4 else "")
         raise MeshFileError(
-            f"has no joint for bones that a VRM animation needs: {listed}",
+            f"has no joint for bones that a VRM animation needs: {listed(missing, 4)}",
             "write a .bvh file, or say what its joints are",
             where=character.name,
         )

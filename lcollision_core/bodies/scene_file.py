@@ -19,7 +19,7 @@ from lcollision_core.bodies.names import unique_names
 from lcollision_core.bodies.remembered import open_body, open_character
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember, ScenePart
-from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.errors import LCollisionError, ModelFileError, listed
 from lcollision_core.files import Character, Rig, read_character, read_mesh
 from lcollision_core.files.safe import atomic_write, read_regular
 from lcollision_core.files.scene.transforms import from_rotation_vectors
@@ -241,9 +241,8 @@ def joint_named(body: Body, name: str) -> int:
     for given, names_known in ((name, list(names)), (name.rsplit(":", 1)[-1].lower(), plain)):
         if given in names_known:
             return names_known.index(given)
-    first_names = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
     raise LCollisionError(
-        f"has no joint {name!r}", f"its joints are {first_names}", where=body.name
+        f"has no joint {name!r}", f"its joints are {listed(names)}", where=body.name
     )
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import ShapeError
+from lcollision_core.errors import ShapeError, listed
 from lcollision_core.json_values import from_json, to_json
 
 CHARACTER_REST_EXCLUSION = 0.02
@@ -262,15 +262,14 @@ class ContactRules:
 
     def described(self) -> str:
         """Describe the excluded pairs, as in "pairs that touch at rest"; empty if all count."""
-        groups = ", ".join(map(pair_in_words, self.ignored[:_NAMED_PAIRS]))
-        more = len(self.ignored) - _NAMED_PAIRS
+        groups = listed(map(pair_in_words, self.ignored), _NAMED_PAIRS)
         around = f" or within {self.rest_exclusion:g} of such a pair" if self.rest_exclusion else ""
         left_out = self.left_out_in_words().removeprefix("without ")
         descriptions = (
             left_out and f"pairs of parts left out ({left_out})",
             self.near_exclusion and f"pairs {self._near_in_words()}",
             self.rest_exclusion is not None and f"pairs that touch at rest{around}",
-            groups and f"pairs of {groups}{f' and {more} more' if more > 0 else ''}",
+            groups and f"pairs of {groups}",
             self.tolerate_something and f"pairs not deeper than {self._tolerated_in_words()}",
             self.joint_exclusion and "pairs at a joint that links their parts",
             self.touching
@@ -296,9 +295,7 @@ class ContactRules:
 
     def left_out_in_words(self) -> str:
         """List the groups left out, as in "without Axe, Cape"; empty if there are none."""
-        names, more = self.left_out[:_NAMED_PAIRS], len(self.left_out) - _NAMED_PAIRS
-        listed = ", ".join(names) + (f" and {more} more" if more > 0 else "")
-        return f"without {listed}" if names else ""
+        return f"without {listed(self.left_out, _NAMED_PAIRS)}" if self.left_out else ""
 
     def _near_in_words(self) -> str:
         by_limb = ", less at thin limbs" if self.near_by_limb else ""
@@ -340,8 +337,8 @@ class ContactRules:
         ]
         if not counts_text:
             return left_out
-        listed = " and ".join(filter(None, [", ".join(counts_text[:-1]), counts_text[-1]]))
-        not_counted = f"{listed} {'is' if counts.total == 1 else 'are'} not counted"
+        pairs_text = " and ".join(filter(None, [", ".join(counts_text[:-1]), counts_text[-1]]))
+        not_counted = f"{pairs_text} {'is' if counts.total == 1 else 'are'} not counted"
         return ", ".join(filter(None, (left_out, not_counted)))
 
 

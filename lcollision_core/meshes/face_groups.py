@@ -10,7 +10,7 @@ from difflib import get_close_matches
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import LCollisionError, ShapeError
+from lcollision_core.errors import LCollisionError, ShapeError, listed
 from lcollision_core.meshes.contact_rules import MAX_GROUP_NAME_LENGTH, ContactRules
 from lcollision_core.meshes.topology import Topology
 
@@ -154,8 +154,7 @@ def named_pair(
     for first, second in splits:
         if first in names and second in names:
             return first, second
-    listed = ", ".join(sorted(names)[:_LISTED]) + (" ..." if len(names) > _LISTED else "")
-    where, next_step = f"{what_it_is} {entry!r}", f"name two of {listed}"
+    where, next_step = f"{what_it_is} {entry!r}", f"name two of {listed(sorted(names))}"
     if not splits:
         what = "is not A:B with the names of two groups of faces"
         raise LCollisionError(what, next_step, where=where)
@@ -199,10 +198,10 @@ def named_group(entry: str, names: Collection[str]) -> str:
     by_small = {name.lower(): name for name in sorted(names)}
     near = get_close_matches(entry.lower(), by_small, _LISTED, 0.5)
     near += [small for small in by_small if entry.lower() in small and small not in near]
-    listed = ", ".join([by_small[small] for small in near or by_small][:_LISTED])
+    near_names = listed(by_small[small] for small in near or by_small)
     raise LCollisionError(
         "is not a group of faces of this mesh",
-        f"name one of {listed}" if listed else "",
+        f"name one of {near_names}" if near_names else "",
         where=repr(entry),
     )
 
@@ -232,8 +231,8 @@ def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: in
     group_names = dict.fromkeys(group.name for group in named)
     for name in rules.named_groups:
         if name not in group_names:
-            listed = ", ".join(map(repr, list(group_names)[:8])) or "none: the mesh has no groups"
-            raise ShapeError("is unknown", where=f"the group {name!r}", expected=listed)
+            expected = listed(map(repr, group_names)) or "none: the mesh has no groups"
+            raise ShapeError("is unknown", where=f"the group {name!r}", expected=expected)
 
 
 def ignored_faces_digest(rules: ContactRules, groups: Iterable[FaceGroup]) -> str:

@@ -38,7 +38,7 @@ from lcollision_core.bodies.motions import (
 )
 from lcollision_core.bodies.retargeting import require_skeleton
 from lcollision_core.bodies.scene_body import SceneMember
-from lcollision_core.errors import LCollisionError, MeshFileError
+from lcollision_core.errors import LCollisionError, MeshFileError, listed
 from lcollision_core.files import (
     FileStamp,
     as_stored,
@@ -577,7 +577,7 @@ def require_motions(
             )
         require_written(output.path, character)
     elif output.form == "frames" and len(motions) > 1:
-        names = ", ".join(repr(motion.name) for motion in motions[:8])
+        names = listed(repr(motion.name) for motion in motions)
         raise LCollisionError(
             f"holds one motion, but there are {len(motions)}: {names}",
             "choose one with --clip, or name a folder",

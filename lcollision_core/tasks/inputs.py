@@ -27,6 +27,7 @@ from lcollision_core.errors import (
     ModelFileError,
     PoseSetError,
     WrongScaleError,
+    listed,
 )
 from lcollision_core.files import PoseSet, mesh_files
 from lcollision_core.files.mesh_file import KEEP_PRECISION
@@ -123,9 +124,7 @@ def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None
         # Generators write joint positions beside the motion, which also has the rotations.
         files, others = [path for path in files if path not in places], places + others
     if files and others:
-        names = ", ".join(path.relative_to(folder).as_posix() for path in others[:3])
-        if len(others) > 3:
-            names = say("{names} and {n} more", names=names, n=len(others) - 3)
+        names = listed((path.relative_to(folder).as_posix() for path in others), 3)
         left_out = say_number(
             len(others),
             "{folder}: skipped {names}: no motion in it",

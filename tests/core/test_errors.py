@@ -17,10 +17,19 @@ from lcollision_core.errors import (
     ShapeError,
     UnwritablePoseError,
     WrongScaleError,
+    listed,
 )
 from lcollision_core.files.scene.scene import NoMeshError
 from lcollision_core.serve.messages import RefusedMessageError
 from lcollision_core.tasks.learning import MostlyCollidingError
+
+
+@pytest.mark.parametrize(
+    ("n", "text"), [(0, ""), (1, "hat 0"), (2, "hat 0, hat 1"), (5, "hat 0, hat 1 and 3 more")]
+)
+def test_a_list_of_names_says_how_many_more_there_are(n: int, text: str) -> None:
+    assert listed((f"hat {number}" for number in range(n)), 2) == text
+
 
 SENTENCES = [
     (

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lcollision_core.errors import MeshFileError
+from lcollision_core.errors import MeshFileError, listed
 from lcollision_core.files.mesh.polygons import are_of_same_polygons
 from lcollision_core.files.scene.appearance import Appearance, join_appearances
 from lcollision_core.files.scene.scene import MAX_FRAME_NUMBERS, Part, Scene, ScenePoses
@@ -184,7 +184,7 @@ def sample_clip(
     """
     clips = [clip for clip in scene.clips if clip.name == name]
     if not clips:
-        clip_names = ", ".join(repr(clip.name) for clip in scene.clips[:8]) or "none"
+        clip_names = listed(repr(clip.name) for clip in scene.clips) or "none"
         raise MeshFileError(
             f"it has no clip {name!r}, its clips are: {clip_names}", "name one of them"
         )

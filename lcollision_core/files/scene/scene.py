@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import MeshFileError
+from lcollision_core.errors import MeshFileError, listed
 from lcollision_core.files.scene.appearance import Appearance
 from lcollision_core.files.scene.transforms import are_regular, is_regular
 from lcollision_core.meshes.topology import FloatArray
@@ -313,9 +313,7 @@ def with_parts(scene: Scene, kept: Sequence[int], why: str) -> Scene:
 
 def left_out_note(what: str, names: Iterable[str]) -> str:
     """Return a note followed by names, of which only the first few are listed."""
-    different = list(dict.fromkeys(names))
-    more = f" and {len(different) - _NAMED} more" if len(different) > _NAMED else ""
-    return f"{what}: {', '.join(different[:_NAMED])}{more}"
+    return f"{what}: {listed(dict.fromkeys(names), _NAMED)}"
 
 
 def parents_first(parents: npt.NDArray[np.int64]) -> list[int]:

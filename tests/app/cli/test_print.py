@@ -119,7 +119,7 @@ def test_what_cannot_be_printed_is_one_sentence_and_no_file(
     for arguments, sentence in (
         (("body", one_pose, "-o", tmp_path / "figure.obj"), "must be a .stl or .3mf file"),
         (("body", one_pose, "-o", path, "--height", 0), "--height"),
-        (("body", one_pose, "-o", path, "--pose", "two"), "has 0 poses named 'two'; name one by"),
+        (("body", one_pose, "-o", path, "--pose", "two"), "has no pose named 'two'; name one by"),
         (("body", one_pose, "-o", path, "--without", "component 1"), "leaves nothing to print"),
         (("body", one_pose, "-o", path, "--without", "hat"), "hat"),
         (("body", windmill.with_name("none.obj"), "-o", path), "none.obj"),
