@@ -49,6 +49,8 @@ def contacts(
     if not body.has_predictor:
         with progress_bar("Looking for pairs in contact") as job:
             proposed = propose_rules(body, job)
+        if ignore_proposed and proposed is None:
+            note("nothing to ignore: few sampled poses collide, or no place touches in nearly all")
     if ignore_proposed and proposed is not None:
         body, proposed = body.with_rules(proposed.rules), None
     keep_rules(model_name, before, body.rules)
@@ -59,7 +61,7 @@ def contacts(
     tell(f"{body.name}: {'every pair counts' if body.rules.exclude_nothing else sentence}")
     if proposed is not None:
         fields = {
-            "poses": counted(proposed.n_poses, "pose"),
+            "poses": counted(proposed.n_poses, "sampled pose"),
             "then": proposed.n_colliding_then or "none",
             "places": counted(len(proposed.new), "place"),
         }

@@ -868,15 +868,15 @@ class ProposalCard(Card):
         if then:
             remaining = say_number(
                 then,
-                "With {places} ignored, {n} pose still collides elsewhere.",
-                "With {places} ignored, {n} poses still collide elsewhere.",
+                "With {places} ignored, {n} of them still collides elsewhere.",
+                "With {places} ignored, {n} of them still collide elsewhere.",
                 places=places,
             )
         now = say_number(
             proposed.n_colliding,
             "{n} of {poses} collides, and the same parts touch in nearly all of them.",
             "{n} of {poses} collide, and the same parts touch in nearly all of them.",
-            poses=counted(proposed.n_poses, "pose"),
+            poses=counted(proposed.n_poses, "sampled pose"),
         )
         self.text.setText(f"{now} {remaining}")
         lines = [

@@ -164,7 +164,9 @@ def test_contact_rules_of_a_character_are_shown_proposed_and_chosen(
     assert isinstance(body, RigBody)
     remember_choices(body.with_rules(ContactRules()))
     first = lcollision("contacts", file)
-    assert first.stdout.startswith("hero: every pair counts\n  10 of 10 poses collide, 1 without")
+    assert first.stdout.startswith(
+        "hero: every pair counts\n  10 of 10 sampled poses collide, 1 without"
+    )
     assert "--ignore-proposed" in first.stdout
     assert first.stderr == ""
     report = json.loads(lcollision("contacts", file, "--json").stdout)
@@ -176,6 +178,7 @@ def test_contact_rules_of_a_character_are_shown_proposed_and_chosen(
     assert accepted.exit_code == 0
     assert "touch in nearly every pose" in accepted.stdout
     assert open_body(file).rules == proposed
+    assert "nothing to ignore: " in lcollision("contacts", file, "--ignore-proposed").stderr
     restored = lcollision("contacts", file, "--defaults", "--ignore", "Head:Head")
     assert restored.exit_code == 0
     assert open_body(file).rules == replace(body.own_rules, ignored=(("Head", "Head"),))
@@ -536,6 +539,8 @@ def test_bad_input_is_refused_in_a_sentence_and_leaves_nothing(
     output = work / "out"
     refusals = [
         (("info", other_model), "not an LCollision model"),
+        (("info", "."), "it is a folder, not a plain file"),
+        (("domains", tube, "--role", "Leg"), "'Leg' does not set a role; write JOINT=ROLE"),
         (("info", tube, "--figure", work / "m.jpg"), "must be a .png file"),
         (("info", tube, "--figure", work / "none" / "m.png"), "no folder"),
         (("encode", tube, mesh, foreign, "-o", poses), "foreign.obj has 415 faces"),
@@ -545,6 +550,9 @@ def test_bad_input_is_refused_in_a_sentence_and_leaves_nothing(
         (("encode", other_model, mesh, "-o", poses), "not an LCollision model"),
         (("decode", tube, poses, "-o", output), "no such file"),
         (("decode", tube, mesh, "-o", output), "not JSON"),
+        (("encode", tube, mesh, "-o", poses, "--scale", "nan"), "scale must be a number above 0"),
+        (("encode", tube, mesh, "-o", poses, "--scale", "1e300"), "is too large for the coord"),
+        (("blender-addon", "-o", work / "addon.txt"), "must be a .zip file"),
         (("sample", tube, "-n", 1, "-o", work / "poses"), "must be a .json file"),
         (("train", "embedding", work / "none.npz", "-o", work / "m.safetensors"), "none.npz"),
         (("train", "embedding", dataset, "-o", work / "m.obj"), "a model is a .safetensors file"),
