@@ -33,6 +33,8 @@ def parse_json(content: bytes) -> Any:
     ValueError : it is not JSON, is nested too deeply, or its values would take more memory than
         `MAX_MEMORY`.
     """
+    if not content.strip():
+        raise ValueError("it is empty")
     if sum(content.count(mark) * each for mark, each in _BYTES_EACH.items()) > MAX_MEMORY:
         raise ValueError(f"its values would take more than {MAX_MEMORY >> 20} MiB of memory")
     try:

@@ -850,7 +850,9 @@ class LearningRequest(RuleOptions):
     )
     fps: Annotated[
         float | None,
-        Option("Frames per second. Default: the animation's keys.", metavar="X", above=0),
+        Option(
+            "Frames per second. Default: the animation's keys.", metavar="X", low=0.01, high=1000.0
+        ),
     ] = None
     up: Annotated[
         int | None,

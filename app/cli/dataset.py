@@ -194,6 +194,8 @@ def make(
     fps: Annotated[
         float | None,
         typer.Option(
+            min=0.01,
+            max=1000.0,
             metavar="X",
             help="Frames per second. Default: the animation's keys, at most 30 a second.",
         ),
@@ -261,11 +263,12 @@ def _gathered(
             job=job,
         )
     for remark in poses.notes:
-        note(remark)
+        note(f"{sources[0]}: {remark}")
     if by_rig is not None:
         drawn = poses.provenance["sources"][-1]["by_rig"]
         n_drawn = counted(drawn["drawn"], "pose")
-        note(f"{drawn['free']} of {n_drawn} by the rig are free of collisions")
+        verb = "is" if drawn["free"] == 1 else "are"
+        note(f"{drawn['free']} of {n_drawn} by the rig {verb} free of collisions")
     if not (guess := poses.up).is_sure:
         note(f"{up_text(guess)}; --up x|y|z overrides it")
     return poses

@@ -163,12 +163,30 @@ def _drop_what_is_buffered() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+_EXPECTED = {
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "float_parsing": "a number",
+    "greater_than_equal": "at least {ge}",
+    "less_than_equal": "at most {le}",
+}
+"""What an option must be, by the type of Pydantic's error."""
+
+
 def _refuse_usage(error: Any) -> NoReturn:
-    sentence = error.format_message().rstrip(".").replace("Value error, ", "")
+    sentence = error.format_message().rstrip(".?").replace("Value error, ", "")
     if "\n" in sentence:  # a group without a command: its help, not an error
         raise error
+    invalid: dict[str, Any] = next(iter(getattr(error.__cause__, "errors", list)()), {})
+    if expected := _EXPECTED.get(invalid.get("type", "")):
+        got = invalid["input"]
+        if str(got).strip("+-").lower() == "nan":
+            expected = "a number"
+        limits = {name: f"{limit:.15g}" for name, limit in invalid.get("ctx", {}).items()}
+        option = max(error.param.opts, key=len)
+        sentence = str(LCollisionError.must_be(option, expected.format(**limits), got))
     program = error.ctx.command_path if error.ctx else "lcollision"
-    note(f"{sentence}; see {program} --help")
+    note(f"{sentence.replace('. Did you mean', ', did you mean')}; see {program} --help")
     raise typer.Exit(ExitStatus.BAD_INPUT)
 
 

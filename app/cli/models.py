@@ -118,7 +118,7 @@ def _being_learned(name_or_path: str) -> dict[str, Any] | None:
     from lcollision_core.tasks.work_folder import WorkFolder
 
     path = Path(name_or_path)
-    if len(path.parts) == 1 and path.suffix != MODEL_SUFFIX:
+    if len(path.parts) <= 1 and path.suffix != MODEL_SUFFIX:
         path = user_models_folder() / f"{path}{MODEL_SUFFIX}"
     work = WorkFolder(path)
     if path.exists() or not work.path.is_dir():
@@ -172,7 +172,13 @@ def domains(
     body = open_body(model_name)
     role_of_joint: dict[str, str | None] = {}
     for request in roles or []:
-        joint, _, role = request.rpartition("=")
+        joint, equals, role = request.rpartition("=")
+        if not equals:
+            raise LCollisionError(
+                "does not set a role",
+                "write JOINT=ROLE, such as LeftLeg=knee-left",
+                where=f"{request!r}",
+            )
         role_of_joint[joint] = None if role == "auto" else role
     if role_of_joint:
         set_joint_roles(body, role_of_joint)
@@ -188,7 +194,7 @@ def domains(
         ):
             tell(f"  {joint}: {role_name(joint_role, side)}")
     for remark in body.notes:
-        note(remark)
+        note(f"{body.name}: {remark}")
 
 
 def upright(
@@ -321,10 +327,12 @@ def _predictor_sentence(report: dict[str, Any]) -> str:
 
 def _size_sentence(report: dict[str, Any]) -> str:
     n_shapes = len(report["shapes"])
-    shapes = f", {n_shapes} of them sliders of morph targets" if n_shapes else ""
+    sliders = "a slider of a morph target" if n_shapes == 1 else "sliders of morph targets"
+    shapes = f", {n_shapes} of them {sliders}" if n_shapes else ""
     return (
-        f"{report['vertices']} vertices, {report['faces']} faces, {report['poses']} poses, "
-        f"{len(report['domains'])} domains, {report['latent_size']} codes a pose{shapes}"
+        f"{counted(report['vertices'], 'vertex', 'vertices')}, {counted(report['faces'], 'face')}, "
+        f"{counted(report['poses'], 'pose')}, {counted(len(report['domains']), 'domain')}, "
+        f"{counted(report['latent_size'], 'code')} a pose{shapes}"
     )
 
 
@@ -352,6 +360,7 @@ def _percent(fraction: float) -> str:
 def _print_domains(report: dict[str, Any]) -> None:
     for number, domain in enumerate(report["domains"], start=1):
         tell(
-            f"  {number:2d}  {domain['name']}  ({domain['vertices']} vertices, "
-            f"{domain['codes']} codes)"
+            f"  {number:2d}  {domain['name']}  "
+            f"({counted(domain['vertices'], 'vertex', 'vertices')}, "
+            f"{counted(domain['codes'], 'code')})"
         )

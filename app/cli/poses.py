@@ -143,7 +143,7 @@ def sample(
     may_touch = touch_entries(touch, clearance)
     model = open_scene(model_name, scene).with_options(rules).with_touching(may_touch)
     for remark in model.notes:
-        note(remark)
+        note(f"{model.name}: {remark}")
     with progress_bar("Drawing poses") as job:
         latent = sample_poses(model, count, seed, colliding, job, clearance, error_bound)
     width = len(str(count))

@@ -31,7 +31,9 @@ def blender_addon(
     """
     from app.blender_addon import addon_zip
     from lcollision_core.files.safe import atomic_write
+    from lcollision_core.tasks.exporting import require_output
 
+    require_output(output, ".zip")
     data = addon_zip()
     with atomic_write(output) as file:
         file.write(data)

@@ -129,7 +129,7 @@ def find_model(name_or_path: str | os.PathLike[str]) -> Path:
                 f"run its command again, which goes on from {unfinished}",
                 where=f"the training of {str(path)!r}",
             )
-    if len(path.parts) == 1:
+    if len(path.parts) == 1 and not path.is_dir():
         names = ", ".join(model.name for model in listed) or "none yet"
         close = get_close_matches(path.name, [model.name for model in listed], 1)
         meant = f" (did you mean {close[0]}?)" if close else ""

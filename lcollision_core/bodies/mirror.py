@@ -15,7 +15,7 @@ import scipy
 
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import PoseSetError, ShapeError, WrongScaleError
-from lcollision_core.files.mesh_file import can_hold, first_not_finite
+from lcollision_core.files.mesh_file import can_hold, first_not_finite, in_unit
 from lcollision_core.files.scene.transforms import from_rotation_vectors
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform, Topology, body_size
@@ -98,8 +98,6 @@ def checked_mesh(
     WrongScaleError : the mesh is larger or smaller than the reference, as in another unit.
     PoseSetError : the vertex order differs, or the mesh is too far from the origin for its digits.
     """
-    if not 0.0 < scale < np.inf:
-        raise ShapeError.must_be("the scale", "a number above 0", f"{scale:g}")
     mesh = np.asarray(vertices, dtype=np.float64)
     if mesh.shape != reference.shape:
         raise ShapeError.must_be(f"a mesh of {model}", f"of shape {reference.shape}", mesh.shape)
@@ -110,7 +108,7 @@ def checked_mesh(
             "the mesh lies so far from the origin that its coordinates lose their digits",
             "move it nearer to the origin",
         )
-    mesh = mesh * scale
+    mesh = in_unit(mesh, scale)
     lengths, reference_lengths = (topology.edge_lengths(pose) for pose in (mesh, reference))
     size, limit = scale_of(lengths, reference_lengths), LARGEST_SIZE
     if size is None:

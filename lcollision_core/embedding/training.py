@@ -83,8 +83,7 @@ def train_embedding(
     LCollisionError : the checkpoint belongs to another run, or is damaged.
     CancelledError : the job was cancelled; the checkpoint holds the last epoch.
     """
-    if len(pose_set) < 2:
-        raise PoseSetError("one pose isn't enough to learn from", "a pose set needs at least two")
+    require_several(pose_set)
     trainer = _Trainer(
         pose_set,
         config or EmbeddingConfig(),
@@ -93,6 +92,12 @@ def train_embedding(
         seed,
     )
     return trainer.train()
+
+
+def require_several(pose_set: PoseSet) -> None:
+    """Refuse a single pose, as of a set whose poses are nearly the same, with a `PoseSetError`."""
+    if len(pose_set) < 2:
+        raise PoseSetError("one pose isn't enough to learn from", "add poses that differ from it")
 
 
 class _Trainer:

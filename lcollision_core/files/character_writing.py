@@ -39,6 +39,7 @@ from lcollision_core.files.scene.scene import (
     Primitive,
     ScenePoses,
     by_node,
+    left_out_note,
     parents_first,
 )
 from lcollision_core.files.scene.transforms import compose, decompose, signs_on_one_side
@@ -314,7 +315,8 @@ def write_character(
         else:
             clips = source.drop_clips()
         data = source.signed(rules)
-    notes += [f"its clip {clip!r} is left out, as it would hide the pose" for clip in clips]
+    if clips:
+        notes.append(left_out_note("clips left out, as they would hide the pose", clips))
     with atomic_write(path) as out:
         out.write(data)
     return PosedFile(data, stored, (*source.patch.notes, *notes))
@@ -385,7 +387,9 @@ def write_character_clips(
                 source.require_near(track, frame_vertices)
                 seen(number, track)
         data = source.signed(rules)
-    notes = (*source.patch.notes, *(f"its clip {clip!r} is left out" for clip in left_out))
+    notes = source.patch.notes
+    if left_out:
+        notes = (*notes, left_out_note("clips left out", left_out))
     with atomic_write(path) as out:
         out.write(data)
     return data, notes

@@ -281,6 +281,26 @@ def first_not_finite(vertices: npt.NDArray[Any], largest: float = np.inf) -> int
     return int(np.flatnonzero(~finite.all(axis=1))[0])
 
 
+LARGEST_COORDINATE = 1e150
+"""Largest coordinate, whose square is finite."""
+
+
+def in_unit(vertices: npt.NDArray[Any], factor: float) -> npt.NDArray[np.float64]:
+    """Return vertices in another unit, as float64.
+
+    Raises
+    ------
+    ShapeError : the factor is not a number above 0, or a coordinate's square would overflow.
+    """
+    if not 0.0 < factor < np.inf:
+        advice = "give the factor from the file's unit to the model's"
+        raise ShapeError.must_be("the scale", "a number above 0", f"{factor:g}", advice)
+    if float(np.abs(vertices).max(initial=0.0)) > LARGEST_COORDINATE / factor:
+        raise ShapeError("is too large for the coordinates", where=f"the scale {factor:g}")
+    scaled: npt.NDArray[np.float64] = vertices.astype(np.float64) * factor
+    return scaled
+
+
 def write_mesh(
     path: str | os.PathLike[str],
     vertices: npt.NDArray[Any],

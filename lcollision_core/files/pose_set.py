@@ -15,13 +15,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError, ShapeError
+from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError, ShapeError, listed
 from lcollision_core.files.animated import read_animated
 from lcollision_core.files.mesh_file import (
     KEEP_PRECISION,
+    LARGEST_COORDINATE,
     audit_mesh,
     coarseness_of,
     first_not_finite,
+    in_unit,
     read_mesh,
 )
 from lcollision_core.files.safe import MAX_ITEMS, atomic_write, read_npz, write_npz
@@ -180,9 +182,6 @@ _EXTRA_ARRAYS = (
 )
 _MAX_TEXT_LENGTH = 500
 
-_LARGEST_COORDINATE = 1e150
-"""Largest coordinate, whose square is finite."""
-
 
 @dataclass(frozen=True, eq=False)
 class PoseSet:
@@ -260,11 +259,7 @@ class PoseSet:
         ------
         ShapeError : the factor is not a number above 0, or a coordinate would overflow.
         """
-        if not 0.0 < factor < np.inf:
-            raise ShapeError.must_be("the scale", "a number above 0", f"{factor:g}")
-        if float(np.abs(self.vertices).max()) > np.finfo(np.float64).max / max(factor, 1.0):
-            raise ShapeError("is too large for the coordinates", where=f"the scale {factor:g}")
-        vertices = self.vertices.astype(np.float64) * factor
+        vertices = in_unit(self.vertices, factor)
         metres = None if self.metres is None else self.metres / factor
         return replace(self, vertices=vertices, metres=metres)
 
@@ -431,12 +426,12 @@ def collect_poses(
 
 def _too_far_to_compute(where: str, vertices: npt.NDArray[Any]) -> PoseSetError | None:
     """Return the error for a vertex of a pose that is not finite or too far out, if any."""
-    vertex = first_not_finite(vertices, _LARGEST_COORDINATE)
+    vertex = first_not_finite(vertices, LARGEST_COORDINATE)
     if vertex is None:
         return None
     what = (
         f"has vertex {vertex} (from 0) at {vertices[vertex].tolist()}, which is not finite or "
-        f"beyond {_LARGEST_COORDINATE:g}"
+        f"beyond {LARGEST_COORDINATE:g}"
     )
     return PoseSetError(what, "remove or scale that pose", where=where)
 
@@ -524,7 +519,7 @@ def _collect_folder(
         for note, times in notes.items()
     ]
     if others:
-        sentences.append(f"{len(others)} other entries were ignored: {', '.join(others[:5])}")
+        sentences.append(f"entries that are no meshes were ignored: {listed(others, 5)}")
     # The glTF standard defines y as up.
     up_axis = 1 if formats.keys() <= set(GLTF_SUFFIXES) else None
     pose_set = PoseSet(
@@ -626,8 +621,9 @@ def _meshes_of(
     meshes = []
     for name, short_name in _MESH_ARRAYS:
         if name not in arrays:
-            others = ", ".join(sorted(held)[:8])[:_MAX_TEXT_LENGTH] or "nothing"
-            raise MeshFileError(f"it has no array {name!r} or {short_name!r}, only {others}")
+            others = listed(sorted(held))[:_MAX_TEXT_LENGTH]
+            only = f", only {others}" if others else ""
+            raise MeshFileError(f"it has no array {name!r} or {short_name!r}{only}")
         meshes.append(arrays[name])
     vertices, faces = meshes
     if vertices.ndim != 3 or vertices.shape[2] != 3 or 0 in vertices.shape:

@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from mimetypes import MimeTypes
 from pathlib import Path, PurePath
+from tempfile import TemporaryFile
 from tokenize import TokenError
 from typing import IO, Any, BinaryIO
 
@@ -336,8 +337,13 @@ def require_writable(path: str | os.PathLike[str]) -> None:
     MeshFileError : see `atomic_write`.
     """
     folder = _plain_file_in_a_folder(path).parent
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise MeshFileError.unwritable(path, f"{folder} is read-only", "choose another place")
+    try:
+        # Permissions alone do not tell, as of /proc or a full disk.
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        what = f"no file can be made in {folder} ({error.strerror})"
+        raise MeshFileError.unwritable(path, what, "choose another place") from error
 
 
 def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:

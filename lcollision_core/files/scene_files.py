@@ -146,4 +146,4 @@ def as_file_error(path: str | os.PathLike[str], what: str = "cannot be read") ->
                 "it needs more memory than there is", "decimate the mesh"
             ) from error
     except (MeshFileError, PoseSetError) as error:
-        raise MeshFileError.because(path, what, error, "export the mesh again") from error
+        raise MeshFileError.because(path, what, error, "export it again") from error

@@ -20,6 +20,7 @@ from lcollision_core.bodies.proposed_rules import places_of, propose_rules
 from lcollision_core.bodies.scoring import CARD_POSES, score_kinds
 from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox, train_embedding
 from lcollision_core.embedding.bilevel import BOX_SCALE
+from lcollision_core.embedding.training import require_several
 from lcollision_core.embedding.training_run import EmbeddingConfig, TrainingStatus
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
 from lcollision_core.files import PoseSet, read_pose_set, write_pose_set
@@ -636,6 +637,7 @@ class _Learner:
         )
         if request.scale != 1.0:
             gathered = gathered.scaled(request.scale)
+        require_several(gathered)
         poses = with_proposed_rules(gathered, request, self._part(_GATHERED))
         write_pose_set(path, poses)
         return poses

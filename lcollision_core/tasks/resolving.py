@@ -395,7 +395,7 @@ def resolve_motions(request: ResolveMotionsRequest, job: Job) -> list[ResolvedCl
     if not files:
         files = [own_file(body)]
         for sentence in body.notes:
-            job.note(sentence)
+            job.note(f"{body.name}: {sentence}")
     output = as_frames(request.output, files)
     for path in files:
         body = body_of_motion(body, path, job)

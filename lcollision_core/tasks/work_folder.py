@@ -80,8 +80,8 @@ class WorkFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise MeshFileError.because(
-                self.path, "cannot be made", error, "choose another place for the model"
+            raise MeshFileError.unwritable(
+                self.destination, error, "choose another place for the model"
             ) from error
         with self.lock():
             self.finished_model(request)

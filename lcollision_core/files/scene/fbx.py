@@ -393,8 +393,9 @@ def _frame_times(name: str, start: float, end: float, said: float) -> FloatArray
     ntsc = round(1.001 * said) / 1.001
     rates = [ntsc, said] if ntsc and abs(said - ntsc) < _NTSC_ROUNDING * said else [said]
     if not (np.isfinite([start, end]).all() and 0.0 <= (end - start) * said < _MOST_FRAMES):
-        raise MeshFileError.must_be(
-            f"clip {name!r}", f"of 0 to {_MOST_FRAMES} frames", f"{start:g} to {end:g} s"
+        what = f"its clip {name!r}, from {start:g} to {end:g} s at {said:g} frames a second,"
+        raise MeshFileError(
+            f"{what} must have 1 to {_MOST_FRAMES} frames", "export fewer frames of it"
         )
     steps = (end - start) * np.array(rates)
     off = np.abs(steps - np.rint(steps))

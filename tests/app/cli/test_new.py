@@ -89,6 +89,7 @@ def test_a_character_is_posed_by_its_rig_and_given_back_in_its_own_file(
     ("arguments", "sentence"),
     [
         (("{folder}/none.glb",), "none.glb"),
+        (("{folder}/same.npz",), "one pose isn't enough to learn from; add poses that differ"),
         (("{tube}", "--by-rig", "5"), "has no joints to pose it by"),
         (("{tube}", "--ignore", "nose"), "the ignored pair 'nose' is not A:B"),
         (("{tube}", "-o", "{folder}/tube.obj"), "a model is a .safetensors file"),
@@ -98,6 +99,8 @@ def test_what_cannot_be_learned_from_is_one_sentence(
     arguments: tuple[str, ...], sentence: str, tube: Path, tmp_path: Path, lcollision: Lcollision
 ) -> None:
     given = [one.format(folder=tmp_path, tube=tube) for one in arguments]
+    poses = bending_tube(2)
+    write_pose_set(tmp_path / "same.npz", replace(poses, vertices=poses.vertices[[0, 0]]))
     output = () if "-o" in given else ("-o", tmp_path / "m.safetensors")
     result = lcollision("new", *given, *output, "--quality", "quick")
     assert result.exit_code == 2

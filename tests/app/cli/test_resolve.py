@@ -431,10 +431,12 @@ def test_a_sequence_is_resolved_as_a_motion_and_told_to_be_deprecated(
     ("options", "sentence"),
     [
         (("--threshold", "0"), "the threshold must be over 0.0, got 0"),
-        (("--threshold", "1.5"), "--threshold': Input should be less than or equal to 1"),
+        (("--threshold", "1.5"), "--threshold must be at most 1, got 1.5; see lcollision resolve"),
         (("--solver", "magic"), "unknown solver 'magic'; choose one of sqp, auglag"),
         (("--metric", "near"), "unknown metric 'near'; choose one of vertices, latent"),
-        (("--margin", "-2"), "--margin': Input should be greater than or equal to 0"),
+        (("--margin", "-2"), "--margin must be at least 0, got -2"),
+        (("--budget", "nan"), "--budget must be a number, got nan"),
+        (("--substeps", "1.5"), "--substeps must be a whole number, got 1.5"),
         (("--lock", "tail"), "has no domain 'tail'; its domains are"),
         (("--lock", "0"), "has no domain '0'; its domains are"),
         (("--weight", "1"), "--weight '1' is not DOMAIN=W"),
@@ -494,8 +496,10 @@ def test_an_output_that_cannot_be_is_refused_first(
     lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "free").write_text("mine")
+    has_proc = Path("/proc/self").exists()
     for out, sentence in (
         (tmp_path / "no" / "free.json", "there is no folder"),
+        *([("/proc/free.json", "/proc/free.json cannot be written: no file can")] * has_proc),
         (tmp_path / "free.docx", ".docx is not a format of poses"),
         (tmp_path / "free.fbx", ".fbx is not a format of poses"),
         (tmp_path / "free.txt", ".txt is not a format of poses"),

@@ -155,7 +155,7 @@ def test_a_clip_of_too_many_frames_is_left_out_and_said(tmp_path: Path) -> None:
     assert character.topology.n_vertices == len(tube()[0])
     (note,) = [note for note in character.notes if "endless" in note]
     assert note.startswith("its clip 'endless' is left out: ")
-    assert "0 to 1000000 frames" in note
+    assert "from 0 to 100000 s at 30 frames a second, must have 1 to 1000000 frames" in note
 
 
 def test_reading_stops_when_it_is_cancelled(

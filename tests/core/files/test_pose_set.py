@@ -84,7 +84,7 @@ def test_other_entries_are_ignored_and_named(tmp_path: Path) -> None:
     (folder / "._mesh0.obj").write_text("x")
     pose_set = read_pose_set(folder)
     assert len(pose_set) == 2
-    assert pose_set.notes == ("2 other entries were ignored: readme.txt, textures",)
+    assert pose_set.notes == ("entries that are no meshes were ignored: readme.txt, textures",)
 
 
 def test_quads_are_noted_once_for_the_set(tmp_path: Path) -> None:

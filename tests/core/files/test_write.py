@@ -199,10 +199,7 @@ def test_clips_that_would_hide_the_pose_are_left_out(
     _, posed = _written(character, form, path)
     description, _ = described(path)
     assert [animation["name"] for animation in description["animations"]] == ["orbit"]
-    assert posed.notes == (
-        "its clip 'wave' is left out, as it would hide the pose",
-        "its clip 'walk' is left out, as it would hide the pose",
-    )
+    assert posed.notes == ("clips left out, as they would hide the pose: wave, walk",)
 
 
 @pytest.mark.parametrize("form", FORMS)
