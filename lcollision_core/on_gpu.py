@@ -13,7 +13,7 @@ import math
 import threading
 from collections.abc import Callable
 from types import FunctionType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,7 @@ from numba import config
 from numba import cuda as cuda
 from numba.cuda import libdevice
 
-Arrays = TypeVar("Arrays", bound=NamedTuple)
+Arrays = TypeVar("Arrays")
 DeviceArray = Any
 """An array in the memory of the GPU."""
 
@@ -81,8 +81,11 @@ def rows_for(n_rows: int) -> int:
 
 
 def copied(arrays: Arrays) -> Arrays:
-    """Copy a named tuple of arrays to the GPU."""
-    return type(arrays)(*map(cuda.to_device, arrays))
+    """Copy an array, or a named tuple of arrays and such tuples, to the GPU."""
+    if isinstance(arrays, tuple):
+        return type(arrays)(*map(copied, arrays))
+    on_device: Arrays = cuda.to_device(arrays)
+    return on_device
 
 
 class Buffers:

@@ -87,7 +87,7 @@ def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int],
         return [candidates[row] for row in np.unique(table[counts, 0])]
 
     # Skip most pairs near at rest, by single vertices; the rules decide on the rest.
-    start, near = detector._exclusions.near_start, detector._exclusions.near
+    start, near = detector._exclusions.near
     first = np.repeat(np.arange(body.n_vertices), np.diff(start))
     apart_at_rest = np.linalg.norm(body.reference[first] - body.reference[near], axis=1)
     first, near = (one[apart_at_rest < 0.02 * size] for one in (first, near))

@@ -402,13 +402,12 @@ class Body(ABC):
         """
         predictor = self.predictor
         if predictor is None:
-            raise ModelFileError(*self._no_predictor)
+            reason, advice = self.no_predictor
+            raise ModelFileError(reason.format(name=self.name), advice)
         return predictor
 
-    @property
-    @abstractmethod
-    def _no_predictor(self) -> tuple[str, str]:
-        """Why there is no predictor, and advice."""
+    no_predictor: tuple[str, str]
+    """Why there is no predictor, with a field for the body's name, and advice."""
 
     @property
     def can_resolve(self) -> bool:
@@ -902,10 +901,13 @@ class Body(ABC):
         """D, the number of a latent pose's codes."""
         return len(self.space.low)
 
+    has_unit = False
+    """Whether the data's unit is known even if the card's is a metre, as it is by default."""
+
     @property
     def known_metres(self) -> float | None:
         """Length of the data's unit in metres; None if unknown."""
-        return None if self.card.metres == 1.0 else self.card.metres
+        return self.card.metres if self.has_unit or self.card.metres != 1.0 else None
 
     @property
     def body_size(self) -> float:

@@ -244,6 +244,11 @@ class LearnedBody(Body):
     ModelFileError : the card's number of domains or poses differs from the embedding's.
     """
 
+    no_predictor = (
+        "the model {name!r} has no predictor",
+        "run `lcollision label` and then `lcollision train predictor`",
+    )
+
     def __init__(
         self,
         name: str,
@@ -497,11 +502,6 @@ class LearnedBody(Body):
         from lcollision_core.predictor import PredictorRecord
 
         return PredictorRecord.of_section(section, self.embedding)
-
-    @property
-    def _no_predictor(self) -> tuple[str, str]:
-        how = "run `lcollision label` and then `lcollision train predictor`"
-        return f"the model {self.name!r} has no predictor", how
 
     @cached_property
     def free_latent(self) -> FloatArray:

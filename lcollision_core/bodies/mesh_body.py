@@ -48,6 +48,8 @@ class MeshBody(Body):
     ShapeError : the reference cannot be checked.
     """
 
+    no_predictor = "the mesh has no predictor", "name a model"
+
     def __init__(
         self,
         frames: npt.NDArray[np.floating],
@@ -131,10 +133,6 @@ class MeshBody(Body):
 
     def _fit(self, vertices: FloatArray, job: Job, *, in_place: bool) -> LatentFit:  # noqa: ARG002
         self._refuse()
-
-    @property
-    def _no_predictor(self) -> tuple[str, str]:
-        return "the mesh has no predictor", "name a model"
 
     @cached_property
     def fingerprint(self) -> str:

@@ -469,6 +469,9 @@ class RigBody(Body):
     notes : sentences about changes made on reading, and other differences from the file
     """
 
+    no_predictor = "the character {name!r} has no predictor", "train a model of its poses"
+    has_unit = True
+
     def __init__(
         self, character: Character, space: RigPoseSpace, card: ModelCard, poses: FloatArray
     ) -> None:
@@ -618,15 +621,6 @@ class RigBody(Body):
 
     def _vertex_labels(self) -> npt.NDArray[np.str_]:
         return joint_parts(self.character, self._space.anatomy)
-
-    @property
-    def _no_predictor(self) -> tuple[str, str]:
-        return f"the character {self.name!r} has no predictor", "train a model of its poses"
-
-    @property
-    def known_metres(self) -> float:
-        """Length of the data's unit in metres, from the character's file."""
-        return self.card.metres
 
     @cached_property
     def free_latent(self) -> FloatArray:

@@ -153,6 +153,9 @@ class SceneBody(Body):
     vertices_of, faces_of : slices of each member's vertices and faces, by name
     """
 
+    no_predictor = "a scene of several bodies has no predictor", "open one of them"
+    has_unit = True
+
     def __init__(
         self, members: Sequence[SceneMember], name: str = "", file: SceneFile | None = None
     ) -> None:
@@ -441,15 +444,6 @@ class SceneBody(Body):
         ]
         arrays: dict[str, npt.NDArray[Any]] = {}
         return digest_of("scene " + "; ".join(members), arrays)[:16]
-
-    @property
-    def _no_predictor(self) -> tuple[str, str]:
-        return "a scene of several bodies has no predictor", "open one of them"
-
-    @property
-    def known_metres(self) -> float:
-        """Length of the scene's unit in metres."""
-        return self.card.metres
 
     @property
     def own_rules(self) -> ContactRules:

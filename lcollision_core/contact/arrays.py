@@ -34,52 +34,49 @@ class FaceTree(NamedTuple):
     size: IntArray
 
 
+class Lists(NamedTuple):
+    """Lists of faces or vertices, each ascending; list i is ``entry[start[i]:start[i + 1]]``.
+
+    Attributes
+    ----------
+    start : (n + 1,) int64
+    entry : (m,) int32
+    """
+
+    start: npt.NDArray[np.int64]
+    entry: IntArray
+
+
 class Exclusions(NamedTuple):
     """The pairs of faces of one mesh that do not count by `ContactRules`.
 
-    Two faces are near each other at rest if a corner of one is a corner of the other or near it:
-    the vertices near vertex v and after it are ``near[near_start[v]:near_start[v + 1]]``. Pairs
-    that touch at rest are listed by face: the partners of face f that come after it are
-    ``face[start[f]:start[f + 1]]``. Pairs of groups are kept by region, as two groups relate too
-    many faces for a list. The joints that face f lies about are
-    ``joint[joint_start[f]:joint_start[f + 1]]``: two faces about one joint do not count. Pairs that
-    nearly always touch, or touch in shapes, are listed like those that touch at rest. Lists are
-    ascending, and all of one kind may be missing.
+    Two faces are near each other at rest if a corner of one is a corner of the other or near it.
+    Two faces about one joint do not count. Pairs of groups are kept by region, as two groups relate
+    too many faces for a list. All lists of one kind may be missing.
 
     Attributes
     ----------
     corners : (F, 3) int32, vertex indices
-    near_start : (V + 1,) or (1,) int64
-    near : (m,) int32, vertex indices
-    start : (F + 1,) or (1,) int64
-    face : (n,) int32, face indices
+    near : for each of V vertices, the later ones near it
+    rest, touching, shape : for each of F faces, the later ones that touch it at rest, in nearly
+        every pose, or in shapes
+    joint : for each of F faces, the numbers of the joints that it lies about
     region : (F,) int32, the region of each face: faces of one region are in the same groups; (0,)
         if the rules name no groups
     ignored : (R, R) bool, symmetric, whether a pair of regions is ignored
     squared_tolerance : (R, R) float64, symmetric, square of the tolerated depth of a pair of
         regions, in normalised length squared; (1, 1) if the rules name no groups
-    joint_start : (F + 1,) or (1,) int64
-    joint : (k,) int32, joint numbers
-    touching_start : (F + 1,) or (1,) int64
-    touching : (t,) int32, face indices
-    shape_start : (F + 1,) or (1,) int64
-    shape : (s,) int32, face indices
     """
 
     corners: IntArray
-    near_start: npt.NDArray[np.int64]
-    near: IntArray
-    start: npt.NDArray[np.int64]
-    face: IntArray
+    near: Lists
+    rest: Lists
+    touching: Lists
+    shape: Lists
+    joint: Lists
     region: IntArray
     ignored: npt.NDArray[np.bool_]
     squared_tolerance: npt.NDArray[np.float64]
-    joint_start: npt.NDArray[np.int64]
-    joint: IntArray
-    touching_start: npt.NDArray[np.int64]
-    touching: IntArray
-    shape_start: npt.NDArray[np.int64]
-    shape: IntArray
 
 
 class ClearanceRule(NamedTuple):

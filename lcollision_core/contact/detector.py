@@ -332,7 +332,7 @@ class CollisionDetector:
 
     def touching_faces(self) -> IntArray:
         """Return the faces of the patches that, by the rules, touch in nearly every pose."""
-        start, entry = self._exclusions.touching_start, self._exclusions.touching
+        start, entry = self._exclusions.touching
         return np.union1d(np.flatnonzero(np.diff(start)), entry).astype(np.int32)
 
     def rules_of(

@@ -13,11 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lcollision_core.contact.arrays import ClearanceRule, Exclusions
+from lcollision_core.contact.arrays import ClearanceRule, Exclusions, Lists
 from lcollision_core.contact.kernels import find_rules
 from lcollision_core.contact.reach import (
     Creases,
-    Lists,
     faces_near_touching,
     faces_within,
     lists_of,
@@ -70,15 +69,15 @@ def exclusions_of(
     ShapeError : the rules name an unknown group, a group has faces that the mesh lacks, or too
         many pairs are excluded.
     """
-    near, by_rest = no_lists(0), no_lists(0)
+    near = rest = no_lists(0)
     if rules.near_exclusion > 0.0:
         surface, distance = surface_of(topology, reference), rules.near_exclusion * body_size
         creases = _creases(topology, reference, groups) if rules.near_by_limb else None
         near = vertices_after(surface, distance, partial(require_listable, rule=_NEAR), creases)
     if rules.rest_exclusion is not None:
         distance = rules.rest_exclusion * body_size
-        by_rest = _about(topology, reference, touching, distance, _REST)
-    return _listed(near, by_rest, rules, topology, reference, body_size, groups)
+        rest = _about(topology, reference, touching, distance, _REST)
+    return _listed(near, rest, rules, topology, reference, body_size, groups)
 
 
 def _creases(
@@ -127,14 +126,12 @@ def with_other_rules(
 
     Parameters and errors are those of `exclusions_of`.
     """
-    near = Lists(exclusions.near_start, exclusions.near)
-    by_rest = Lists(exclusions.start, exclusions.face)
-    return _listed(near, by_rest, rules, topology, reference, body_size, groups)
+    return _listed(exclusions.near, exclusions.rest, rules, topology, reference, body_size, groups)
 
 
 def _listed(
     near: Lists,
-    by_rest: Lists,
+    rest: Lists,
     rules: ContactRules,
     topology: Topology,
     reference: FloatArray,
@@ -149,8 +146,7 @@ def _listed(
     require_groups(rules, groups, n_faces)
     region, ignored, squared_tolerance = _regions(rules, without_joints(groups), n_faces)
     joints = [group.faces for group in groups if group.about_joint and rules.joint_exclusion]
-    by_joint = lists_of(joints, n_faces) if joints else no_lists(0)
-    by_touch, by_shape = (
+    touching, shape = (
         _about(topology, reference, _faces_of(patches, n_faces), radius * body_size, _TOUCHING)
         for patches, radius in (
             (rules.touching, rules.touching_radius),
@@ -158,20 +154,15 @@ def _listed(
         )
     )
     return Exclusions(
-        corners=topology.faces,
-        near_start=near.start,
-        near=near.entry,
-        start=by_rest.start,
-        face=by_rest.entry,
-        region=region,
-        ignored=ignored,
-        squared_tolerance=squared_tolerance,
-        joint_start=by_joint.start,
-        joint=by_joint.entry,
-        touching_start=by_touch.start,
-        touching=by_touch.entry,
-        shape_start=by_shape.start,
-        shape=by_shape.entry,
+        topology.faces,
+        near,
+        rest,
+        touching,
+        shape,
+        lists_of(joints, n_faces) if joints else no_lists(0),
+        region,
+        ignored,
+        squared_tolerance,
     )
 
 

@@ -304,8 +304,11 @@ def is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
 
 
 @compiled_part
-def _is_listed(start, entry, number, wanted):
-    """Whether list `number`, which is ascending, has an entry `wanted`."""
+def _is_listed(lists, number, wanted):
+    """Whether list `number` has an entry `wanted`; false if there are no lists."""
+    start, entry = lists
+    if len(start) == 1:
+        return False
     low = start[number]
     end = start[number + 1]
     high = end
@@ -319,8 +322,11 @@ def _is_listed(start, entry, number, wanted):
 
 
 @compiled_part
-def _have_common(start, entry, a, b):
-    """Whether lists a and b, both short and ascending, have an entry in common."""
+def _have_common(lists, a, b):
+    """Whether lists a and b, both short, have an entry in common; false if there are no lists."""
+    start, entry = lists
+    if len(start) == 1:
+        return False
     i, j = start[a], start[b]
     while i < start[a + 1] and j < start[b + 1]:
         if entry[i] == entry[j]:
@@ -337,15 +343,15 @@ def rule_of(face_a, face_b, squared_depth, exclusions):
     """Return the first rule that excludes two faces, or `COUNTED`; `COINCIDENT` for depth 0."""
     if squared_depth == 0.0:
         return np.uint8(COINCIDENT)
-    if len(exclusions.near_start) > 1:
+    if len(exclusions.near.start) > 1:
         for i in range(3):
             for j in range(3):
                 a, b = exclusions.corners[face_a, i], exclusions.corners[face_b, j]
-                if _is_listed(exclusions.near_start, exclusions.near, min(a, b), max(a, b)):
+                if _is_listed(exclusions.near, min(a, b), max(a, b)):
                     return np.uint8(NEAR)
     first = min(face_a, face_b)
     second = max(face_a, face_b)
-    if len(exclusions.start) > 1 and _is_listed(exclusions.start, exclusions.face, first, second):
+    if _is_listed(exclusions.rest, first, second):
         return np.uint8(REST)
     one = other = np.int32(0)
     if len(exclusions.region) > 0:
@@ -354,17 +360,11 @@ def rule_of(face_a, face_b, squared_depth, exclusions):
             return np.uint8(IGNORED)
     if squared_depth <= exclusions.squared_tolerance[one, other]:
         return np.uint8(TOLERATED)
-    if len(exclusions.joint_start) > 1 and _have_common(
-        exclusions.joint_start, exclusions.joint, first, second
-    ):
+    if _have_common(exclusions.joint, first, second):
         return np.uint8(JOINT)
-    if len(exclusions.touching_start) > 1 and _is_listed(
-        exclusions.touching_start, exclusions.touching, first, second
-    ):
+    if _is_listed(exclusions.touching, first, second):
         return np.uint8(TOUCHING)
-    if len(exclusions.shape_start) > 1 and _is_listed(
-        exclusions.shape_start, exclusions.shape, first, second
-    ):
+    if _is_listed(exclusions.shape, first, second):
         return np.uint8(SHAPE)
     return np.uint8(COUNTED)
 

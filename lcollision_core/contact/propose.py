@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from lcollision_core.contact.arrays import Lists
 from lcollision_core.contact.detector import CollisionDetector
 from lcollision_core.contact.exclusions import require_listable
 from lcollision_core.contact.kernels import NEAR
-from lcollision_core.contact.reach import Lists, faces_within, lists_of, matrix_of, surface_of
+from lcollision_core.contact.reach import faces_within, lists_of, matrix_of, surface_of
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.contact_rules import MAX_TOUCHING, STRICT
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup, require_groups

@@ -10,10 +10,10 @@ import numpy.typing as npt
 import scipy
 
 from lcollision_core.compiled import compiled, compiled_part
+from lcollision_core.contact.arrays import IntArray, Lists
 from lcollision_core.jobs import for_blocks
 from lcollision_core.meshes.topology import FloatArray, Topology
 
-IntArray = npt.NDArray[np.int32]
 LongArray = npt.NDArray[np.int64]
 
 _LISTS_AT_ONCE = 512
@@ -59,19 +59,6 @@ class Creases(NamedTuple):
     length: FloatArray
     joints: FloatArray
     joint_length: FloatArray
-
-
-class Lists(NamedTuple):
-    """Lists of faces or vertices, each ascending; list i is ``entry[start[i]:start[i + 1]]``.
-
-    Attributes
-    ----------
-    start : (n + 1,) int64
-    entry : (m,) int32
-    """
-
-    start: LongArray
-    entry: IntArray
 
 
 def no_lists(n: int) -> Lists:

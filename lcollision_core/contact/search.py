@@ -13,7 +13,6 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 import numpy.typing as npt
-import scipy
 
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.contact.arrays import (
@@ -21,6 +20,7 @@ from lcollision_core.contact.arrays import (
     Exclusions,
     FaceTree,
     IntArray,
+    Lists,
     PairBuffer,
     PoseWorkspace,
     SkippableNodes,
@@ -41,6 +41,7 @@ from lcollision_core.contact.kernels import (
     search_poses,
     test_pairs,
 )
+from lcollision_core.contact.reach import matrix_of
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, Topology
 
@@ -233,9 +234,11 @@ class UncountedTables:
 
     def _are_worthwhile(self) -> bool:
         exclusions, n_leaves = self._exclusions, len(self._tree.slot_face) // LEAF_SIZE
-        n_listed = len(exclusions.near) + len(exclusions.face) + len(exclusions.touching)
+        n_listed = sum(
+            len(lists.entry) for lists in (exclusions.near, exclusions.rest, exclusions.touching)
+        )
         return (
-            (n_listed + len(exclusions.joint) > 0 or bool(exclusions.ignored.any()))
+            (n_listed + len(exclusions.joint.entry) > 0 or bool(exclusions.ignored.any()))
             and n_listed <= MOST_LISTED
             and n_leaves**2 // 6 <= MOST_BYTES
         )
@@ -269,9 +272,7 @@ def make_uncounted(
     start = np.cumsum(size * stride) - size * stride
     bits = np.zeros(size @ stride, dtype=np.uint8)
     tables = SkippableNodes(level, number, start, stride, bits)
-    near = _both_ways(exclusions.near_start, exclusions.near)
-    rest = _both_ways(exclusions.start, exclusions.face)
-    touching = _both_ways(exclusions.touching_start, exclusions.touching)
+    near, rest, touching = map(_both_ways, (exclusions.near, exclusions.rest, exclusions.touching))
     for first in range(0, int(size[leaves]), _LEAVES_AT_ONCE):
         if not keep_going():
             return None
@@ -285,20 +286,14 @@ def make_uncounted(
 class _SymmetricLists(NamedTuple):
     """Lists of the later partners of each item, and of the earlier ones."""
 
-    start: npt.NDArray[np.int64]
-    entry: IntArray
-    start_before: npt.NDArray[np.int64]
-    entry_before: IntArray
+    later: Lists
+    earlier: Lists
 
 
-def _both_ways(start: npt.NDArray[np.int64], entry: IntArray) -> _SymmetricLists:
-    n = len(start) - 1
-    after = scipy.sparse.csr_matrix(
-        (np.ones(len(entry), dtype=np.bool_), entry, start), shape=(n, n)
-    )
-    before = after.T.tocsr()
+def _both_ways(later: Lists) -> _SymmetricLists:
+    before = matrix_of(later, len(later.start) - 1).T.tocsr()
     return _SymmetricLists(
-        start, entry, before.indptr.astype(np.int64), before.indices.astype(np.int32)
+        later, Lists(before.indptr.astype(np.int64), before.indices.astype(np.int32))
     )
 
 
@@ -317,25 +312,19 @@ def _fill_depths(left: IntArray, right: IntArray, depth: IntArray) -> None:
 
 
 @compiled_part
-def _mark(
-    start: npt.NDArray[np.int64],
-    entry: IntArray,
-    of: int,
-    mask: npt.NDArray[np.uint8],
-    bit: np.uint8,
-) -> None:
-    """Set a bit in the mask of every entry of one list."""
-    for k in range(start[of], start[of + 1]):
-        mask[entry[k]] |= bit
+def _mark(lists: Lists, of: int, mask: npt.NDArray[np.uint8], bit: np.uint8) -> None:
+    """Set a bit in the mask of every entry of one list; there may be no lists."""
+    if len(lists.start) > 1:
+        for k in range(lists.start[of], lists.start[of + 1]):
+            mask[lists.entry[k]] |= bit
 
 
 @compiled_part
 def _mark_both_ways(
     lists: _SymmetricLists, of: int, mask: npt.NDArray[np.uint8], bit: np.uint8
 ) -> None:
-    if len(lists.start) > 1:
-        _mark(lists.start, lists.entry, of, mask, bit)
-        _mark(lists.start_before, lists.entry_before, of, mask, bit)
+    _mark(lists.later, of, mask, bit)
+    _mark(lists.earlier, of, mask, bit)
 
 
 @compiled
@@ -359,7 +348,7 @@ def _fill_leaves(
     of_vertex = np.empty(corners.max() + 1, dtype=np.uint8)
     of_face = np.empty(len(corners), dtype=np.uint8)
     of_region = np.empty(len(exclusions.ignored), dtype=np.uint8)
-    joint_start, joint = exclusions.joint_start, exclusions.joint
+    joint_start, joint = exclusions.joint
     of_joint = np.empty(joint.max() + 1 if len(joint) else 0, dtype=np.uint8)
     n_leaves, all_bits = len(tree.slot_face) // leaf_size, np.uint8(2**leaf_size - 1)
     level = made.level[len(tree.left) - 1]
@@ -382,8 +371,7 @@ def _fill_leaves(
                 _mark_both_ways(near, v, of_vertex, bit)
             _mark_both_ways(rest, face, of_face, bit)
             _mark_both_ways(touching, face, of_face, bit)
-            if len(joint) > 0:
-                _mark(joint_start, joint, face, of_joint, bit)
+            _mark(exclusions.joint, face, of_joint, bit)
             if len(region) > 0:
                 for r in range(len(of_region)):
                     if exclusions.ignored[region[face], r]:

@@ -75,7 +75,7 @@ def test_the_estimate_is_close() -> None:
     rng = np.random.default_rng(2)
     bent = mesh.vertices + rng.normal(scale=0.003, size=mesh.vertices.shape)
     detector = CollisionDetector(mesh.topology, bent, ContactRules(0.2))
-    listed = len(detector._exclusions.near)
+    listed = len(detector._exclusions.near.entry)
     estimate = near_pairs_estimate(mesh.topology, bent, 0.2 * detector.body_size)
     assert estimate == pytest.approx(listed, rel=0.35)
 
