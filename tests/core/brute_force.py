@@ -149,17 +149,19 @@ def depths(a: FloatArray, b: FloatArray) -> FloatArray:
     depth = np.full(len(a), np.inf)
     active = np.arange(len(a))
     points = (a[:, :, None] - b[:, None, :]).reshape(-1, 9, 3)
-    for i, j, k in TRIPLES:
+    # All planes at once for few pairs; for many, those that a plane separates are left out early.
+    for triples in np.array_split(TRIPLES, min(1 + len(a) // 100, len(TRIPLES))):
         here = points[active]
-        u, v = here[:, j] - here[:, i], here[:, k] - here[:, i]
+        i, j, k = (here[:, corners] for corners in triples.T)
+        u, v = j - i, k - i
         n = np.cross(u, v)
-        length = np.linalg.norm(n, axis=1)
-        spans = length > 1e-12 * np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)
-        n = n[spans] / length[spans, None]
-        along = np.einsum("pkc,pc->pk", here[spans], n)
-        support = np.minimum(along.max(axis=1), -along.min(axis=1))
-        of = active[spans]
-        depth[of] = np.minimum(depth[of], np.maximum(support, 0.0))
+        length = np.linalg.norm(n, axis=2)
+        spans = length > 1e-12 * np.linalg.norm(u, axis=2) * np.linalg.norm(v, axis=2)
+        n /= np.where(spans, length, 1.0)[:, :, None]
+        along = n @ here.transpose(0, 2, 1)
+        support = np.minimum(along.max(axis=2), -along.min(axis=2))
+        least = np.where(spans, np.maximum(support, 0.0), np.inf).min(axis=1)
+        depth[active] = np.minimum(depth[active], least)
         active = active[depth[active] > 0.0]
     return np.where(np.isinf(depth), 0.0, depth)
 

@@ -69,20 +69,18 @@ def require_no_worse(
         may_change[span.start : span.stop] = True
     assert after.codes[~may_change].tobytes() == before.codes[~may_change].tobytes()
     is_freed = found.after & ~found.before
-    for frame in range(len(before)):
+    original = [overlaps(body, before.vertices(frame, check)) for frame in range(len(before))]
+    for frame, (n_before, depth_before) in enumerate(original):
         old, new = (motion.vertices(frame, check) for motion in (before, after))
         moved = np.linalg.norm(new - old, axis=1).max() / body.body_size
         assert moved <= largest_change + 1e-6
-        (n_before, depth_before), (n_after, depth_after) = (
-            overlaps(body, vertices) for vertices in (old, new)
-        )
+        n_after, depth_after = overlaps(body, new)
         assert n_after <= n_before
         assert depth_after <= depth_before + 2e-9
         assert bool(found.after[frame]) == (n_after == 0)
         assert named[frame] or n_after == 0
         if frame + 1 < len(before) and not is_freed[frame : frame + 2].any():
-            was = [overlaps(body, before.vertices(frame, check, share)) for share in (0.0, 0.5)]
-            was.append(overlaps(body, before.vertices(frame + 1, check)))
+            was = [*original[frame : frame + 2], overlaps(body, before.vertices(frame, check, 0.5))]
             n_between, depth_between = overlaps(body, after.vertices(frame, check, 0.5))
             assert n_between <= max(n for n, _ in was)
             assert depth_between <= max(depth for _, depth in was) + 2e-9
