@@ -352,11 +352,8 @@ class TimelinePanel(QWidget):
             n, depth = left_out.frames, 100.0 * left_out.deepest
             frames = counted(n, "frame")
             if left_out.step > 1:
-                searched = counted(left_out.searched, "frame")
-                frames = say("{n} of {frames} searched", n=n, frames=searched)
-            line = say(
-                "Pairs not counted in {frames}, up to {depth:.2f} %", frames=frames, depth=depth
-            )
+                frames = say("{n} of {searched} searched", n=n, searched=left_out.searched)
+            line = say("Not counted in {frames}, up to {depth:.2f} %", frames=frames, depth=depth)
             text = f"{text}\n{line}"
         self.facts.setText(text, left_out.sentence(self._document.model.rules))
 

@@ -27,6 +27,7 @@ from lcollision_core.bodies import ExportRequest, open_body, read_poses
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.files.gltf.schema import GltfDocument
+from lcollision_core.meshes import contact_rules
 from lcollision_core.motion import MotionOptions
 from lcollision_core.tasks import exporting
 from tests.app.windows import (
@@ -135,9 +136,17 @@ def test_a_click_on_the_strip_goes_there_and_what_it_says_is_what_was_found(
     assert swinging.timeline.facts.text() == f"0 of {N_FRAMES} frames checked"
 
 
+@pytest.mark.parametrize(
+    ("most_searched", "frames"), [(60, f"{N_FRAMES} frames"), (24, "24 of 24 searched")]
+)
 def test_what_is_not_counted_has_a_line_of_its_own_and_is_said_in_full_on_hovering(
-    qtbot: QtBot, swinging: MainWindow
+    qtbot: QtBot,
+    swinging: MainWindow,
+    monkeypatch: pytest.MonkeyPatch,
+    most_searched: int,
+    frames: str,
 ) -> None:
+    monkeypatch.setattr(contact_rules, "_MOST_SEARCHED", most_searched)
     timeline, panel = swinging.document.timeline, swinging.timeline
     swinging.resize(1280, 720)
     settle_layout(qtbot, swinging)
@@ -151,7 +160,7 @@ def test_what_is_not_counted_has_a_line_of_its_own_and_is_said_in_full_on_hoveri
     timeline.checked.emit()
     settle_layout(qtbot, swinging)
     found, line = panel.facts.fitting().split("\n")
-    assert line == f"Pairs not counted in {N_FRAMES} frames, up to 0.39 %"
+    assert line == f"Not counted in {frames}, up to 0.39 %"
     assert "frames collide" in found
     assert panel.facts.height() >= 2 * panel.facts.fontMetrics().height()
     assert panel.facts.parentWidget().height() == height
