@@ -53,12 +53,10 @@ def overlap_text(energy: float) -> str:
     return "none" if energy == 0.0 else height_text(math.sqrt(energy))
 
 
-def height_text(distance: float) -> str:
-    """Format a normalised distance as a share of the body size, as in "1.1 %"."""
-    percent = 100.0 * distance
-    if 0.0 < percent < 0.05:
-        return "below 0.1 %"
-    return f"{percent:.1f} %"
+def height_text(distance: float, digits: int = 1) -> str:
+    """Format a normalised distance as a share of the body size, as in "1.1 %" or "below 0.1 %"."""
+    percent, least = 100.0 * distance, 10.0**-digits
+    return f"below {least:g} %" if 0.0 < percent < least / 2 else f"{percent:.{digits}f} %"
 
 
 def share_text(distance: float) -> str:
@@ -292,12 +290,11 @@ def in_between_text(n_poses: int) -> str:
 def checked_clip_table(verdicts: Iterable[CheckedClip]) -> list[str]:
     """Return the lines of a table of clips, sorted by depth, deepest first."""
     ranked = sorted(verdicts, key=lambda v: (-v.deepest, -len(v.colliding_frames), v.file))
-    lines = [f"{say('deepest'):>9}  {say('frames that collide'):>19}  {say('clip')}"]
+    lines = [f"{say('deepest'):>12}  {say('frames that collide'):>19}  {say('clip')}"]
     for verdict in ranked:
         frames = say("{some} of {n}", some=len(verdict.colliding_frames), n=verdict.frames)
-        lines.append(
-            f"{100.0 * verdict.deepest:7.2f} %  {frames:>19}  {verdict.file}: {verdict.clip}"
-        )
+        deepest = height_text(verdict.deepest, 2)
+        lines.append(f"{deepest:>12}  {frames:>19}  {verdict.file}: {verdict.clip}")
     return lines
 
 
@@ -331,13 +328,13 @@ def checked_clip_text(verdict: CheckedClip) -> str:
         parts.append(
             say_number(
                 len(frames),
-                "{n} of {frames} collides, deepest frame {frame} by {depth:.2f} % of the body "
+                "{n} of {frames} collides, deepest frame {frame} by {depth} of the body "
                 "size ({parts})",
-                "{n} of {frames} collide, deepest frame {frame} by {depth:.2f} % of the body "
+                "{n} of {frames} collide, deepest frame {frame} by {depth} of the body "
                 "size ({parts})",
                 frames=n_frames,
                 frame=worst.frame,
-                depth=100.0 * worst.deepest,
+                depth=height_text(worst.deepest, 2),
                 parts=" and ".join(dict.fromkeys(worst.parts[0])),
             )
         )
@@ -441,8 +438,8 @@ def resolved_clip_text(verdict: ResolvedClip) -> str:
         )
     parts: list[str | None] = [head]
     if not verdict.output and verdict.deepest_before:
-        depth = 100.0 * verdict.deepest_before
-        parts.append(say("up to {depth:.2f} % of the body size deep", depth=depth))
+        depth = height_text(verdict.deepest_before, 2)
+        parts.append(say("up to {depth} of the body size deep", depth=depth))
     if not verdict.output:
         parts.append(in_between_text(verdict.in_between_before))
     elif verdict.in_between_before or verdict.in_between_after:

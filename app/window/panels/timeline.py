@@ -35,6 +35,7 @@ from app.window.widgets import (
 from lcollision_core.tasks.words import (
     counted,
     duration_text,
+    height_text,
     joined,
     menu_text,
     say,
@@ -332,10 +333,10 @@ class TimelinePanel(QWidget):
             facts = [
                 say_number(
                     n_colliding,
-                    "{frames} collides, at most {depth:.1f} % deep",
-                    "{frames} collide, at most {depth:.1f} % deep",
+                    "{frames} collides, at most {depth} deep",
+                    "{frames} collide, at most {depth} deep",
                     frames=colliding if are_all else n_colliding,
-                    depth=100.0 * deep.max(),
+                    depth=height_text(float(deep.max())),
                 )
             ]
         if n_between:
@@ -349,11 +350,11 @@ class TimelinePanel(QWidget):
         text, left_out = with_capital(": ".join(heads)), checks.left_out
         if left_out.frames:
             # On its own line, to be visible in a small window; the tool tip has the details.
-            n, depth = left_out.frames, 100.0 * left_out.deepest
+            n, depth = left_out.frames, height_text(left_out.deepest, 2)
             frames = counted(n, "frame")
             if left_out.step > 1:
                 frames = say("{n} of {searched} searched", n=n, searched=left_out.searched)
-            line = say("Not counted in {frames}, up to {depth:.2f} %", frames=frames, depth=depth)
+            line = say("Not counted in {frames}, up to {depth}", frames=frames, depth=depth)
             text = f"{text}\n{line}"
         self.facts.setText(text, left_out.sentence(self._document.model.rules))
 
