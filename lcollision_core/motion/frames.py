@@ -25,11 +25,14 @@ from lcollision_core.posing.exact import Contacts
 from lcollision_core.resolve import PoseResolver, ResolveOptions
 from lcollision_core.resolve.problem import ResolveProblem
 from lcollision_core.resolve.solvers import polish
-from lcollision_core.resolve.steps import LeastOverlap, slide_back
+from lcollision_core.resolve.steps import LeastOverlap, bisect, slide_back
 
 HalfSpacesOfPose = tuple[FloatArray, FloatArray]
 """(C, D) normals and (C,) offsets that separate the contacts of one pose."""
 
+
+_BISECTIONS = 3
+"""Halvings on the way from a free frame to a colliding pose, to find where contacts begin."""
 
 _BLOCK = 8
 """Frames that a thread checks in one go."""
@@ -139,15 +142,24 @@ class Frames:
     ) -> HalfSpacesOfPose | None:
         """Return the half-spaces of `contacts` for a pose between two frames of (D,) codes.
 
+        If a frame is free, they are those that begin last on the way from one to that pose.
+
         Parameters
         ----------
         share : fraction of the way, in (0, 1)
         """
-        separated = (
-            self._separated(check, codes)
-            for check, codes in self._poses_between(frame, share, start, end)
-        )
-        return next((contacts for contacts in separated if contacts is not None), None)
+        for check, codes in self._poses_between(frame, share, start, end):
+            contacts = self._separated(check, codes)
+            if contacts is None:
+                continue
+            # Limbs that cross each other have contacts that push deeper; the first ones do not.
+            problem, ends = self.problem(frame), [end for end in (start, end) if check.is_free(end)]
+            met = [bisect(check, problem, end, codes, _BISECTIONS)[1] for end in ends]
+            if met:
+                first = min(met, key=lambda pose: self.distance(pose, codes))
+                contacts = self._separated(check, first)
+            return contacts
+        return None
 
     def overlap_between(
         self, frame: int, share: float, start: FloatArray, end: FloatArray
@@ -223,7 +235,7 @@ class Frames:
 
         def collides(frame: int) -> bool:
             return any(
-                self.contacts_between(frame, share, codes[frame], codes[frame + 1]) is not None
+                self.overlap_between(frame, share, codes[frame], codes[frame + 1]) is not None
                 for share in fractions.tolist()
             )
 

@@ -558,9 +558,17 @@ class _Resolution:
         solutions: list[
             tuple[tuple[int, float, int, float], FloatArray, npt.NDArray[np.bool_]]
         ] = []
-        # If few frames first do not free all, or not smoothly, resolve each of them first.
-        for knots in (knots_of(was_free, motion.in_frames(_SPACING)), np.ones_like(was_free)):
+        few, every = knots_of(was_free, motion.in_frames(_SPACING)), np.ones_like(was_free)
+        solved: dict[int, FloatArray] = {}
+        # If few frames first do not free all, smoothly and near enough, go on with all of them from
+        # those that are free; then resolve each of them first.
+        ways = ((few, False), (every, True), (every, False))
+        for knots, keeps in ways[: 2 if few.all() else 3]:
+            if keeps and not solved:
+                continue
             start, known = np.zeros((len(window), motion.codes.shape[1])), was_free.copy()
+            for at, correction in solved.items() if keeps else ():
+                start[at], known[at] = correction, True
             colliding = [[window.start + at for at in run if knots[at]] for run in runs(~known)]
             for frame, correction in chain_corrections(frames, colliding, near, freed).items():
                 start[frame - window.start], known[frame - window.start] = correction, True
@@ -582,13 +590,26 @@ class _Resolution:
             except CancelledError:
                 freed |= {window.start + at: moved for at, moved in program.so_far().items()}
                 raise
-            worth = int((~free).sum()), *program.rank, program.cost(solution)
+            far = self._too_far(window, solution)
+            worth = int((~free | far).sum()), *program.rank, program.cost(solution)
             solutions.append((worth, solution, free))
-            if knots.all() or (program.is_settled and not program.is_jerky(solution)):
+            is_jerky = program.is_jerky(solution)
+            if program.is_settled and not is_jerky and not far.any():
                 break
+            moved = program.is_free_now & ~was_free & ~far
+            solved = {} if is_jerky else {at: solution[at] for at in np.flatnonzero(moved).tolist()}
         _, solution, free = min(solutions, key=lambda tried: tried[0])
         targets = motion.codes[window.start : window.stop]
         return list(zip(_added(targets, solution), free.tolist(), strict=True))
+
+    def _too_far(self, window: range, corrections: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return (n,) which (n, D) corrections of a window exceed the largest change."""
+        frames, targets = self.guard.frames, self.frames.motion.codes
+        near = [
+            not moved.any() or frames.is_near_enough(at, targets[at] + moved)
+            for at, moved in zip(window, corrections, strict=True)
+        ]
+        return ~np.array(near)
 
     def _bar(self, frames: npt.NDArray[np.intp], reason: Reason) -> None:
         self.barred[frames] = True

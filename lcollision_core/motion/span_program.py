@@ -262,10 +262,10 @@ again."""
 _FALLING = 0.4
 """Share of the cost below which a search is followed by another one in any case."""
 
-_MOSTLY_BENT, _BENT_MORE = 0.5, 1.2
+_MOSTLY_BENT, _BENT_MORE = 0.3, 1.2
 """Corrections are jerky if their bends count for more than this share of their size, and the motion
-bends by more than this factor; 0.15 to 0.41 and at most 1.0 were seen, and 0.72 and 4.7 of those of
-a search that had met contacts on the wrong sides."""
+bends by more than this factor; 0.15 to 0.41 and at most 1.0 were seen, and 0.45 to 0.72 and 2.6 to
+4.7 of searches that had met contacts on the wrong sides."""
 
 _STILL = 1e-4
 """Normalised distance from a pose that was free within which a frame is taken as free, until all
@@ -418,6 +418,11 @@ class SpanProgram:
     def rank(self) -> tuple[float, int]:
         """What the last search could not free; less is better."""
         return self._best.rank if self._best is not None else (np.inf, 0)
+
+    @property
+    def is_free_now(self) -> npt.NDArray[np.bool_]:
+        """(n,) whether each frame is free with the corrections of the best search."""
+        return self._best.is_free if self._best is not None else np.zeros_like(self.is_free)
 
     def so_far(self) -> dict[int, FloatArray]:
         """Return the (D,) corrections that free frames, if the search is stopped."""
