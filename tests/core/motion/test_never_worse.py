@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from lcollision_core.motion import (
     resolve_motion,
     screen_motion,
 )
+from lcollision_core.motion.frames import Frames
 from lcollision_core.resolve import ResolveOptions
 from tests.core.brute_force import all_pairs
 from tests.core.motion.swings import CLIP, swinging, swinging_body
@@ -225,8 +227,8 @@ def test_within_a_small_change_a_span_gets_less_overlap() -> None:
     require_no_worse(body, motion, found, 0.02)
 
 
-def test_the_way_between_two_free_frames_gets_no_deeper() -> None:
-    """An arm swings through a leg from one free frame to another."""
+def waving() -> tuple[RigBody, Motion]:
+    """Return a body, and four free frames; an arm swings through a leg after the first."""
     body = RigBody.of(rigged_body())
     rig = body.space.rig
     turns = {
@@ -242,12 +244,31 @@ def test_the_way_between_two_free_frames_gets_no_deeper() -> None:
         vectors[:, rig.joint_names.index(name)] = way
     transforms = [turned(rig, Rotation.from_rotvec(frame).as_matrix()) for frame in vectors]
     codes = body.space.codes_of_transforms(np.stack(transforms))
-    motion = Motion("swing", np.arange(4) / 8.0, codes)
+    return body, Motion("waving", np.arange(4) / 8.0, codes)
+
+
+def test_the_way_between_two_free_frames_gets_no_deeper() -> None:
+    body, motion = waving()
+    assert 0 in screen_motion(motion, body.exact_check()).in_between
     options = MotionOptions(frame=ResolveOptions(largest_change=0.02))
     result = resolve_motion(body.resolver, motion, UP, options)
     assert result.before[:2].all()
-    assert 0 in screen_motion(motion, body.exact_check()).in_between
     require_no_worse(body, motion, result, 0.02)
+
+
+def test_contacts_between_frames_are_those_met_first_from_one_of_them() -> None:
+    body, motion = waving()
+    with ThreadPoolExecutor(1) as pool:
+        frames = Frames(motion, body.resolver, ResolveOptions(), pool)
+        middle = motion.codes[:2].mean(axis=0)
+        deep = frames.contacts(0, middle)
+        contacts = frames.contacts_between(0, 0.5, *motion.codes[:2])
+    assert contacts is not None
+    assert deep is not None
+    normals, offsets = contacts
+    assert 0 < len(offsets) < len(deep[1])
+    assert (normals @ middle > offsets).any()
+    assert (normals @ motion.codes[:2].T <= offsets[:, None]).all(axis=0).any()
 
 
 def test_what_a_file_cannot_hold_is_put_back_in_it(tmp_path: Path) -> None:
