@@ -85,6 +85,18 @@ def jumping() -> PoseSet:
     return _published_set("jumping150.npz")
 
 
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """Return the address of a Dask scheduler with two worker processes."""
+    # Imported here, as only slow tests need it.
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=":0"
+    ) as local:
+        yield local.scheduler_address
+
+
 @pytest.fixture(scope="session")
 def lcollision() -> Lcollision:
     """Run ``lcollision ARGUMENTS``; the result has exit_code, stdout and stderr."""

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from distributed import LocalCluster
 
 from lcollision_core.bodies import open_body
 from lcollision_core.bodies.motions import read_motions
@@ -21,15 +19,6 @@ from tests.rigged_shapes import write_gltf
 pytestmark = pytest.mark.slow
 
 N_FRAMES = 20
-
-
-@pytest.fixture(scope="module")
-def scheduler() -> Iterator[str]:
-    """Return the address of a scheduler with two worker processes."""
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=":0"
-    ) as local:
-        yield local.scheduler_address
 
 
 @pytest.fixture

@@ -6,11 +6,9 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from distributed import Client, LocalCluster
 
 from lcollision_core.errors import CancelledError, LCollisionError, MissingExtraError
 from lcollision_core.jobs import Job
@@ -26,15 +24,6 @@ from tests.core.labelled import files_of
 pytestmark = pytest.mark.slow
 
 N_ROWS = 4 * ROWS_PER_CHUNK + 200
-
-
-@pytest.fixture(scope="module")
-def scheduler() -> Iterator[str]:
-    """Return the address of a scheduler with two worker processes."""
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=":0"
-    ) as local:
-        yield local.scheduler_address
 
 
 def test_a_cluster_gives_the_rows_of_this_process(
@@ -77,6 +66,8 @@ def test_a_cancelled_run_goes_on_here(scheduler: str, labeller: Labeller, tmp_pa
 def test_the_others_do_the_work_of_a_worker_that_dies(
     scheduler: str, labeller: Labeller, tmp_path: Path
 ) -> None:
+    from distributed import Client
+
     with Client(scheduler, set_as_default=False) as client:
         killed = threading.Event()
 
@@ -107,6 +98,7 @@ def test_workers_that_come_late_are_asked_for_their_version(
     scheduler: str, labeller: Labeller, tmp_path: Path
 ) -> None:
     """Simulated by a version that changes after the first chunk."""
+    from distributed import Client
 
     def change(found: str) -> None:
         labelling_run.version = lambda _: found  # type: ignore[assignment]
@@ -132,6 +124,8 @@ def test_workers_that_come_late_are_asked_for_their_version(
 
 
 def test_workers_that_come_late_get_as_much_to_do(labeller: Labeller, tmp_path: Path) -> None:
+    from distributed import Client, LocalCluster
+
     with (
         LocalCluster(
             n_workers=1,
@@ -166,6 +160,8 @@ def test_workers_that_come_late_get_as_much_to_do(labeller: Labeller, tmp_path: 
 def test_no_scheduler_and_no_worker_are_told(
     labeller: Labeller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from distributed import LocalCluster
+
     with monkeypatch.context() as hasty:
         hasty.setattr(labelling_run, "_CONNECT_SECONDS", 1)
         for address in ("tcp://127.0.0.1:9", "nonsense://nowhere"):
