@@ -605,11 +605,12 @@ class _Resolution:
     def _too_far(self, window: range, corrections: FloatArray) -> npt.NDArray[np.bool_]:
         """Return (n,) which (n, D) corrections of a window exceed the largest change."""
         frames, targets = self.guard.frames, self.frames.motion.codes
-        near = [
-            not moved.any() or frames.is_near_enough(at, targets[at] + moved)
-            for at, moved in zip(window, corrections, strict=True)
-        ]
-        return ~np.array(near)
+        near = frames.pool.map(
+            lambda at, moved: not moved.any() or frames.is_near_enough(at, targets[at] + moved),
+            window,
+            corrections,
+        )
+        return ~np.array(list(near))
 
     def _bar(self, frames: npt.NDArray[np.intp], reason: Reason) -> None:
         self.barred[frames] = True
