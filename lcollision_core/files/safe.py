@@ -338,12 +338,20 @@ def require_writable(path: str | os.PathLike[str]) -> None:
     """
     folder = _plain_file_in_a_folder(path).parent
     try:
+        require_folder(folder)
+    except MeshFileError as error:
+        raise MeshFileError.unwritable(path, error) from error
+
+
+def require_folder(folder: str | os.PathLike[str]) -> None:
+    """Refuse a folder in which no file can be made, with a `MeshFileError`."""
+    try:
         # Permissions alone do not tell, as of /proc or a full disk.
         with TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        what = f"no file can be made in {folder} ({error.strerror})"
-        raise MeshFileError.unwritable(path, what, "choose another place") from error
+        what = f"no file can be made in the folder {folder}"
+        raise MeshFileError.because("", what, error, "choose another place") from error
 
 
 def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:

@@ -51,6 +51,7 @@ from lcollision_core.files import (
     unused_name,
 )
 from lcollision_core.files.character_writing import require_written
+from lcollision_core.files.safe import require_folder
 from lcollision_core.files.table import (
     BVH_SUFFIX,
     OWN_SUFFIXES,
@@ -126,7 +127,7 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
     path = Path(name)
     suffix = path.suffix.lower()
     if os.path.isdir(name):  # noqa: PTH112 - returns False for names that are too long
-        require_writable(path / "pose.obj")
+        require_folder(path)
         return Output(path, "folder", None)
     must_be_folder = name.endswith(("/", os.sep))
     forms: dict[str, Literal["poses", "mesh", "frames"]] = {".json": "poses", ".vrm": "mesh"}

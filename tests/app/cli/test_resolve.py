@@ -500,6 +500,7 @@ def test_an_output_that_cannot_be_is_refused_first(
     for out, sentence in (
         (tmp_path / "no" / "free.json", "there is no folder"),
         *([("/proc/free.json", "/proc/free.json cannot be written: no file can")] * has_proc),
+        *([("/proc", "lcollision: no file can be made in the folder /proc: No such")] * has_proc),
         (tmp_path / "free.docx", ".docx is not a format of poses"),
         (tmp_path / "free.fbx", ".fbx is not a format of poses"),
         (tmp_path / "free.txt", ".txt is not a format of poses"),
