@@ -274,7 +274,7 @@ def _resolve_poses(
     )
     from lcollision_core.tasks.inputs import mesh_files_of, read_input_poses
     from lcollision_core.tasks.resolving import resolve_poses
-    from lcollision_core.tasks.scenes import read_scene_poses
+    from lcollision_core.tasks.scenes import parts_text, read_scene_poses
 
     body, output, export = request.body, request.output, request.export
     scene = as_scene(body)
@@ -306,11 +306,16 @@ def _resolve_poses(
         if resolved_pose.result.note:
             note(f"{resolved_pose.given.source}: {resolved_pose.result.note}")
         if not as_json:
+            result, colliding_parts = resolved_pose.result, []
+            if result.exactly_free is False:
+                check = body.exact_check(resolved_pose.given.pose.placement)
+                colliding_parts = parts_text(body, check.find(result.vertices).pairs)
             text = resolved_pose_text(
-                resolved_pose.result,
+                result,
                 request.options.clearance,
                 has_detail=resolved_pose.has_detail,
                 fit=resolved_pose.fit,
+                colliding_parts=colliding_parts,
             )
             tell(f"{resolved_pose.given.source}: {text}")
     if as_json:

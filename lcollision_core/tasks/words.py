@@ -13,6 +13,8 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from lcollision_core.errors import listed
+
 if TYPE_CHECKING:
     from lcollision_core.bodies import MirroredPose
     from lcollision_core.meshes import UpGuess
@@ -363,7 +365,12 @@ def checked_clip_text(verdict: CheckedClip) -> str:
 
 
 def resolved_pose_text(
-    result: ResolveResult, clearance: float, *, has_detail: bool, fit: float | None
+    result: ResolveResult,
+    clearance: float,
+    *,
+    has_detail: bool,
+    fit: float | None,
+    colliding_parts: Sequence[str] = (),
 ) -> str:
     """Describe the outcome of resolving one pose.
 
@@ -373,6 +380,7 @@ def resolved_pose_text(
     clearance : as requested, normalised
     has_detail : whether the output includes the detail lost by encoding
     fit : mean fit error of the encoded mesh, normalised; None for a pose
+    colliding_parts : pairs of names of parts that still penetrate, most pairs of faces first
     """
     from lcollision_core.resolve import Step
 
@@ -406,6 +414,8 @@ def resolved_pose_text(
         ]
     else:
         parts = [say("still colliding"), after]
+    if colliding_parts:
+        parts.append(say("most of {names}", names=listed(colliding_parts, 3)))
     if has_detail:
         parts.append(say("with its detail"))
     elif fit is not None:

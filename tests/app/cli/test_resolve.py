@@ -398,6 +398,7 @@ def test_a_pose_that_may_move_little_keeps_the_least_overlap(
     for row in left:
         assert row["step"] == ("soft" if row["vertex_distance_max"] > 0.0 else "none")
     assert said.stdout.count("still colliding, ") == len(left) > 0
+    assert said.stdout.count(", most of ") == len(left)
     first = left[0]
     share = 100.0 * first["energy_after"] / first["energy_before"]
     assert f"pairs of faces of {first['pairs_before']}, up to " in said.stdout

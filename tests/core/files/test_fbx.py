@@ -153,6 +153,9 @@ def test_a_clip_of_too_many_frames_is_left_out_and_said(tmp_path: Path) -> None:
     character = read_character(path)
     assert list(character.clips) == ["wave"]
     assert character.topology.n_vertices == len(tube()[0])
+    (endless_clip,) = [clip for clip in read_scene(path).clips if clip.name == "endless"]
+    with pytest.raises(MeshFileError, match="; export fewer frames of it"):
+        endless_clip.times(None)
     (note,) = [note for note in character.notes if "endless" in note]
     assert note.startswith("its clip 'endless' is left out: ")
     assert "from 0 to 100000 s at 30 frames a second, must have 1 to 1000000 frames" in note
