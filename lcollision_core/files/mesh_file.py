@@ -290,12 +290,12 @@ def in_unit(vertices: npt.NDArray[Any], factor: float) -> npt.NDArray[np.float64
 
     Raises
     ------
-    ShapeError : the factor is not a number above 0, or a coordinate's square would overflow.
+    ShapeError : the factor is not a number above 0, or makes the square of a coordinate overflow.
     """
     if not 0.0 < factor < np.inf:
         advice = "give the factor from the file's unit to the model's"
         raise ShapeError.must_be("the scale", "a number above 0", f"{factor:g}", advice)
-    if float(np.abs(vertices).max(initial=0.0)) > LARGEST_COORDINATE / factor:
+    if factor > 1.0 and float(np.abs(vertices).max(initial=0.0)) > LARGEST_COORDINATE / factor:
         raise ShapeError("is too large for the coordinates", where=f"the scale {factor:g}")
     scaled: npt.NDArray[np.float64] = vertices.astype(np.float64) * factor
     return scaled
