@@ -140,7 +140,7 @@ def check(
         files = [
             (file, of_clips)
             for path, of_clips in zip(meshes, as_clips, strict=True)
-            for file in (motion_files_of([path], job) if of_clips else mesh_files_of([path]))
+            for file in (motion_files_of if of_clips else mesh_files_of)([path], job)
         ]
         for path, of_clips in files:
             try:

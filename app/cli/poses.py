@@ -144,6 +144,8 @@ def sample(
     model = open_scene(model_name, scene).with_options(rules).with_touching(may_touch)
     for remark in model.notes:
         note(f"{model.name}: {remark}")
+    if error_bound and not model.has_predictor:
+        note(f"{model.name} has no predictor, so --error-bound has no effect")
     with progress_bar("Drawing poses") as job:
         latent = sample_poses(model, count, seed, colliding, job, clearance, error_bound)
     width = len(str(count))

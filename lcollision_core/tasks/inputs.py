@@ -62,8 +62,8 @@ def holds_motion(path: Path) -> bool:
     return of_kind or is_generated(path) or is_smpl_motion(path)
 
 
-def mesh_files_of(inputs: Iterable[Path]) -> list[Path]:
-    """Replace each folder by its mesh files, in natural order.
+def mesh_files_of(inputs: Iterable[Path], job: Job = UNWATCHED) -> list[Path]:
+    """Replace each folder by its mesh files, in natural order; motions are skipped with a note.
 
     Raises
     ------
@@ -74,10 +74,20 @@ def mesh_files_of(inputs: Iterable[Path]) -> list[Path]:
         if not path.is_dir():
             files.append(path)
             continue
-        inside, _ = mesh_files(path)
+        inside, others = mesh_files(path)
+        motions = [name for name in others if Path(name).suffix.lower() in _OF_MOTIONS]
         if not inside:
             advice = f"name a folder of {', '.join(READABLE_SUFFIXES)} files"
             raise MeshFileError("contains no mesh", advice, where=path)
+        if motions:
+            skipped = say_number(
+                len(motions),
+                "{folder}: skipped {names}: no mesh in it",
+                "{folder}: skipped {names}: no mesh in them",
+                folder=path,
+                names=listed(motions, 3),
+            )
+            job.note(skipped)
         files += inside
     return files
 
@@ -124,13 +134,12 @@ def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None
         # Generators write joint positions beside the motion, which also has the rotations.
         files, others = [path for path in files if path not in places], places + others
     if files and others:
-        names = listed((path.relative_to(folder).as_posix() for path in others), 3)
         left_out = say_number(
             len(others),
             "{folder}: skipped {names}: no motion in it",
             "{folder}: skipped {names}: no motion in them",
             folder=folder,
-            names=names,
+            names=listed((path.relative_to(folder).as_posix() for path in others), 3),
         )
         if any(path.suffix.lower() == ".npy" for path in others):
             advice = "{note} that can be read; save arrays by name in an .npz file"

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from lcollision_core.compiled import working_seconds
 from lcollision_core.errors import CancelledError, LCollisionError
-from lcollision_core.files import file_stamp
+from lcollision_core.files import file_stamp, mesh_files
 from lcollision_core.files.safe import write_table
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.options import ExportRequest, MotionChoice, MotionOptions, ResolveOptions
@@ -328,12 +328,16 @@ class ResolveMotionsRequest:
 
         Raises
         ------
-        LCollisionError : the output cannot contain them.
+        LCollisionError : the folder has neither motions nor meshes, or the output cannot contain
+            them.
         """
         if len(self.files) != 1 or not self.files[0].is_dir():
             return self
         (root,) = self.files
         files = motion_files(root, job, besides=self.output.path)
+        if not files and not mesh_files(root)[0]:
+            advice = "name a folder of clips, or of the meshes of successive frames"
+            raise LCollisionError("contains neither a motion nor a mesh", advice, where=root)
         if not files:
             return self
         if self.output.form != "folder":

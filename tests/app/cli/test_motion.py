@@ -505,11 +505,16 @@ def test_the_frames_of_motions_are_checked_as_single_meshes_are(
     refused = lcollision("check", swing, "--clips", "--rest", rest)
     assert refused.exit_code == 2
     assert "has a rest pose of its own; leave it out" in refused.stderr
+    of_meshes = lcollision("check", tmp_path, "--no-rules")
+    assert f"{tmp_path}: skipped walk.mdd: no mesh in it" in of_meshes.stderr
     folder = tmp_path / "clips"
     folder.mkdir()
     nothing = lcollision("check", folder, "--clips")
     assert nothing.exit_code == 2
     assert "clips contains no motion" in nothing.stderr
+    nothing = lcollision("resolve", swing, folder, "--motion", "-o", tmp_path / "free")
+    assert nothing.exit_code == 2
+    assert "clips contains neither a motion nor a mesh; name a folder of clips" in nothing.stderr
     for name in ("a.glb", "b.glb"):
         (folder / name).write_bytes(swing.read_bytes())
     result = lcollision("check", folder, "--clips", "--clip", CLIP, "--no-rules", "--json")
