@@ -358,7 +358,9 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     proposed = document.tasks.proposed_rules
     assert proposed is not None
     assert card.isVisible()
-    assert card.text.text().startswith(f"{proposed.n_colliding} of {proposed.n_poses} sampled poses")
+    assert card.text.text().startswith(
+        f"{proposed.n_colliding} of {proposed.n_poses} sampled poses"
+    )
     assert f"{len(proposed.new)} such places ignored" in card.text.text()
     # The places are listed and tinted at once.
     scene = window.viewport.scene
