@@ -19,6 +19,7 @@ from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
 from lcollision_core.bodies.skeletons import limb_children
 from lcollision_core.bundled import bundled_table
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files.scene.transforms import from_rotation_vectors
 from lcollision_core.meshes.joint_kinds import JOINT_KINDS, Role, Side
 from lcollision_core.meshes.topology import FloatArray
 
@@ -402,10 +403,7 @@ class _Body:
 
 def _turn(left: float, up: float, front: float) -> FloatArray:
     """Return the rotation by degrees about one of left, up and front."""
-    matrix: FloatArray = scipy.spatial.transform.Rotation.from_rotvec(
-        [left, up, front], degrees=True
-    ).as_matrix()
-    return matrix
+    return from_rotation_vectors(np.radians([left, up, front]))
 
 
 def _frame(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -132,10 +132,10 @@ class SelfCollisions:
         """Depth of the deepest pair, normalised; 0 where none collides."""
         return float(self.penetration_depth.max(initial=0.0))
 
-    def exceeds(self, other: SelfCollisions) -> bool:
-        """Whether more pairs collide than in another pose, or one is deeper than its deepest."""
-        is_deeper = self.deepest > other.deepest + DEPTH_TOLERANCE
-        return self.n_pairs > other.n_pairs or is_deeper
+    def exceeds(self, *others: SelfCollisions) -> bool:
+        """Whether more pairs collide than in any other pose, or one is deeper than all theirs."""
+        is_deeper = self.deepest > max(other.deepest for other in others) + DEPTH_TOLERANCE
+        return is_deeper or self.n_pairs > max(other.n_pairs for other in others)
 
 
 @dataclass(frozen=True, slots=True)

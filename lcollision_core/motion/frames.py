@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import DEPTH_TOLERANCE, NearestPair, SelfCollisions
+from lcollision_core.contact import NearestPair, SelfCollisions
 from lcollision_core.devices import block_size, uses_gpu
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes.contact_rules import ExcludedPairs, RuleCounts
@@ -149,16 +149,14 @@ class Frames:
         share : fraction of the way, in (0, 1)
         """
         for check, codes in self._poses_between(frame, share, start, end):
-            contacts = self._separated(check, codes)
-            if contacts is None:
+            self.job.check()
+            if check.is_free(codes):
                 continue
             # Limbs that cross each other have contacts that push deeper; the first ones do not.
             problem, ends = self.problem(frame), [end for end in (start, end) if check.is_free(end)]
             met = [bisect(check, problem, end, codes, _BISECTIONS)[1] for end in ends]
-            if met:
-                first = min(met, key=lambda pose: self.distance(pose, codes))
-                contacts = self._separated(check, first)
-            return contacts
+            first = min(met, key=lambda pose: self.distance(pose, codes), default=codes)
+            return self._separated(check, first)
         return None
 
     def overlap_between(
@@ -813,10 +811,7 @@ class Guard:
         was = self.frames.motion.codes[: self.n]
         ends = (at, (at + 1) % self.n)
         old = [*between(was), *(self._overlap(end, was[end]) for end in ends)]
-        n_pairs, deepest = max(pose.n_pairs for pose in old), max(pose.deepest for pose in old)
-        return any(
-            pose.n_pairs > n_pairs or pose.deepest > deepest + DEPTH_TOLERANCE for pose in new
-        )
+        return any(pose.exceeds(*old) for pose in new)
 
     def _judge(self, at: int, codes: FloatArray) -> tuple[bool, Reason | None]:
         was = self.frames.motion.codes[at]
