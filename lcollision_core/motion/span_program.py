@@ -262,10 +262,10 @@ again."""
 _FALLING = 0.4
 """Share of the cost below which a search is followed by another one in any case."""
 
-_MOSTLY_BENT, _BENT_MORE = 0.3, 1.2
+_MOSTLY_BENT, _BENT_MORE = 0.3, 1.02
 """Corrections are jerky if their bends count for more than this share of their size, and the motion
-bends by more than this factor; 0.15 to 0.41 and at most 1.0 were seen, and 0.45 to 0.72 and 2.6 to
-4.7 of searches that had met contacts on the wrong sides."""
+bends by more than this factor; of one clip with noise, 0.14 to 0.31 and at most 1.02 were seen, and
+0.32 to 60 and 1.02 to 6.7 of searches that had met contacts on the wrong sides."""
 
 _STILL = 1e-4
 """Normalised distance from a pose that was free within which a frame is taken as free, until all
