@@ -262,10 +262,11 @@ again."""
 _FALLING = 0.4
 """Share of the cost below which a search is followed by another one in any case."""
 
-_MOSTLY_BENT, _BENT_MORE = 0.3, 1.02
+_MOSTLY_BENT, _BENT_MORE, _UNSETTLED_BENT_MORE = 0.3, 1.02, 1.2
 """Corrections are jerky if their bends count for more than this share of their size, and the motion
-bends by more than this factor; of one clip with noise, 0.14 to 0.31 and at most 1.02 were seen, and
-0.32 to 60 and 1.02 to 6.7 of searches that had met contacts on the wrong sides."""
+bends by more than this factor, or by more than the second if some frames are not free yet. Of one
+clip with noise, 0.14 to 0.31 and at most 1.02 were seen, and 0.32 to 60 and 1.02 to 6.7 of searches
+that had met contacts on the wrong sides."""
 
 _STILL = 1e-4
 """Normalised distance from a pose that was free within which a frame is taken as free, until all
@@ -550,7 +551,8 @@ class SpanProgram:
             self._square(np.diff(poses, 2, axis=0))
             for poses in (self._targets, self._targets + corrections)
         )
-        return bent > _MOSTLY_BENT * moved and after > _BENT_MORE * before
+        factor = _BENT_MORE if self.is_settled else _UNSETTLED_BENT_MORE
+        return bent > _MOSTLY_BENT * moved and after > factor * before
 
     def _parts(self, corrections: FloatArray) -> tuple[float, float]:
         """Return what the objective counts of the corrections and of their bends."""
