@@ -54,14 +54,14 @@ class Pulls:
 
     Attributes
     ----------
-    apart : indices of touches that are not together
+    apart : the distance that each touch lacks which is not together, by its index
     n_off : number of touches that are not in their place on the ground
     lack : sum of the distances that they lack, normalised
     normals, offsets : (M, D) and (M,): normals Z <= offsets
     standing, places : the same for equations, of patches that stand in their place
     """
 
-    apart: tuple[int, ...]
+    apart: Mapping[int, float]
     n_off: int
     lack: float
     normals: FloatArray
@@ -142,11 +142,11 @@ class KeptContacts:
         codes, vertices : (D,) and (V, 3) of the pose, normalised, in model coordinates
         """
         faces, slopes, bounds, level = space.topology.faces, list[FloatArray](), list[float](), []
-        apart, n_off, lack = list[int](), 0, 0.0
+        apart, n_off, lack = dict[int, float](), 0, 0.0
         for number, touch in enumerate(self.touches[frame]):
             gap, corners, by_corners = self._gap(faces, touch, vertices)
             if abs(gap) > TOGETHER and (gap > 0.0 or touch.second is None):
-                apart.append(number)
+                apart[number] = abs(gap)
                 lack += abs(gap)
             aims = [(_AIM - gap, corners, by_corners, False)]
             if touch.second is None and gap < 0.0:
@@ -172,7 +172,7 @@ class KeptContacts:
             normals = space.pull_back(codes, np.array(slopes))
         offsets = normals @ codes + np.array(bounds)
         return Pulls(
-            tuple(apart),
+            apart,
             n_off,
             lack,
             normals[~is_level],

@@ -8,6 +8,7 @@ entries (a_i^T A^-1 a_j) (n_i^T G^-1 n_j).
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -251,6 +252,9 @@ _STALLED, _NEARER = 4, 0.95
 """Rounds without progress after which patches are left apart, if all is free, and the share of
 their lacking distance below which there is progress."""
 
+_DROPS = 4
+"""Contacts that are left out one by one, before all that stay apart are."""
+
 _SEARCHES, _SETTLED = 6, 0.95
 """Most searches of a span, and the share of the cost that a search must go below to be followed by
 another one."""
@@ -355,6 +359,8 @@ class SpanProgram:
     _pulls: dict[int, Pulls] = field(default_factory=dict)
     _clear: dict[tuple[int, float], FloatArray] = field(default_factory=dict)
     _best: _Evaluation | None = None
+    _n_drops: int = 0
+    _n_dropped: int = 0
 
     def __post_init__(self) -> None:
         # The frames that are checked; others are taken as free.
@@ -388,8 +394,8 @@ class SpanProgram:
     def _settled_search(self, best: _Evaluation, enough: float) -> _Evaluation:
         """Search again while that gains much, and costs more than enough; return the best."""
         gives_way, last = True, 0.0
-        if best.n_apart and self._drop_contacts(best):
-            # Search again without the touches that stay apart.
+        while best.n_apart and self._drop_contacts(best):
+            # Touches that contradict each other may be kept without the one that lacks most.
             best = self._search(None)
         for _ in range(1, _SEARCHES):
             self._best, cost = best, self.cost(best.corrections)
@@ -417,8 +423,9 @@ class SpanProgram:
 
     @property
     def rank(self) -> tuple[float, int]:
-        """What the last search could not free; less is better."""
-        return self._best.rank if self._best is not None else (np.inf, 0)
+        """What the last search could not free, and the touches left out; less is better."""
+        score, n_apart = self._best.rank if self._best is not None else (np.inf, 0)
+        return score, n_apart + self._n_dropped
 
     @property
     def is_free_now(self) -> npt.NDArray[np.bool_]:
@@ -433,16 +440,30 @@ class SpanProgram:
         return {at: self._known[at] - self._targets[at] for at in np.flatnonzero(freed).tolist()}
 
     def _drop_contacts(self, best: _Evaluation) -> bool:
-        """Leave out touches that stay apart; return whether there are any."""
+        """Leave out the contact that lacks most where it stays apart; return whether there is one.
+
+        After some of them, all that stay apart are left out.
+        """
         contacts = self.frames.kept_contacts
         if contacts is None:
             return False
         pulled = self.frames.pool.map(
             self.frames.pulls, self.span, self._targets + best.corrections
         )
-        pulls = zip(self.span, pulled, strict=True)
-        apart = {at: pull.apart for at, pull in pulls if pull is not None and pull.apart}
-        self.frames = replace(self.frames, kept_contacts=contacts.without_touches(apart))
+        lacks: dict[int, float] = defaultdict(float)
+        apart: list[tuple[int, int, int]] = []
+        for at, pulls in zip(self.span, pulled, strict=True):
+            for number, lack in pulls.apart.items() if pulls is not None else ():
+                contact = contacts.touches[at][number].contact
+                lacks[contact] += lack
+                apart.append((at, number, contact))
+        self._n_drops += 1
+        dropped: dict[int, list[int]] = defaultdict(list)
+        for at, number, contact in apart:
+            if self._n_drops > _DROPS or contact == max(lacks, key=lacks.__getitem__):
+                dropped[at].append(number)
+        self._n_dropped += sum(map(len, dropped.values()))
+        self.frames = replace(self.frames, kept_contacts=contacts.without_touches(dropped))
         return bool(apart)
 
     def _forget(self, best: _Evaluation) -> None:
