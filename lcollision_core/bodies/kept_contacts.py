@@ -20,13 +20,16 @@ from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import Motion
 from lcollision_core.motion.contacts import KeptContacts, Touch
-from lcollision_core.motion.motion import STILL, runs
+from lcollision_core.motion.motion import runs
 
 _TOUCHING = 0.01
 """Normalised distance below which parts of the source body touch."""
 
 _PATCH, _SOLE_PATCH = 0.03, 0.04
 """Normalised radius of a patch at rest, and of a patch on the ground."""
+
+_STANDING = 0.015
+"""Normalised speed, per second, below which a patch on the ground stands; a faster one rolls."""
 
 _STEADY = 2.0
 """Smoothing of the centres of sliding patches, in frames."""
@@ -434,7 +437,7 @@ def _soles(
             limb = int(both.limbs[images[0]])
             on_ground = low[:, inside].any(axis=1)
             means = level[:, inside].mean(axis=1)
-            step = np.linalg.norm(np.diff(means, axis=0), axis=1) < STILL / rate
+            step = np.linalg.norm(np.diff(means, axis=0), axis=1) < _STANDING / rate
             still = np.zeros(len(low), dtype=np.bool_)
             still[1:] |= step & on_ground[1:] & on_ground[:-1]
             still[:-1] |= step & on_ground[1:] & on_ground[:-1]
