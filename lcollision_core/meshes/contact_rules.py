@@ -141,7 +141,7 @@ class ExcludedPairs:
         frames = "1 frame" if self.frames == 1 else f"{self.frames} frames"
         if self.step > 1:
             frames = f"{self.frames} of {self.searched} frames that were searched for all pairs"
-        deep = f"up to {100.0 * self.deepest:.2f} % of the body size deep in frame {self.frame}"
+        deep = f"up to {100.0 * self.deepest:.3g} % of the body size deep in frame {self.frame}"
         return f"in {frames} {sentence}, {deep}"
 
 

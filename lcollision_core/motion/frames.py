@@ -741,7 +741,7 @@ class KeptSpan:
         if not self.parts:
             return f"{frames} {verb}: {self.reason}"
         named = " and ".join(dict.fromkeys(part_names[part] for part in self.parts[0]))
-        return f"{frames} {verb}: {named}, {100.0 * self.deepest:.2f} % deep; {self.reason}"
+        return f"{frames} {verb}: {named}, {100.0 * self.deepest:.3g} % deep; {self.reason}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -542,7 +542,7 @@ def test_a_motions_verdict_says_what_it_leaves_out(
     assert "no collisions in" in said
     assert f"in {report['excluded_frames']} frames " in said
     assert f"{report['excluded_pairs']['tolerated']} pairs not deeper than 0.5 are not" in said
-    assert f"up to {100.0 * deepest:.2f} % of the body size deep in frame" in said
+    assert f"up to {100.0 * deepest:.3g} % of the body size deep in frame" in said
     table = tmp_path / "motions.csv"
     lcollision("check", swing, "--clips", *options, "--csv", table)
     rows = list(csv.DictReader(table.read_text().splitlines()))
