@@ -183,17 +183,18 @@ def resolve_motion(
 
 
 class _Reports:
-    """Progress of successive stages as one: frames done, and all frames known so far."""
+    """Progress of several stages as one: frames done, and all frames known so far."""
 
     def __init__(self, job: Job, n_stages: int) -> None:
-        self._job, self._totals = job, [0] * n_stages
+        self._job, self._counts, self._lock = job, [(0, 0)] * n_stages, Lock()
 
     def of(self, stage: int) -> Callable[[int, int], None]:
         """Return the report of one stage."""
 
         def report(n_done: int, n_frames: int) -> None:
-            self._totals[stage] = n_frames
-            self._job.report(sum(self._totals[:stage]) + n_done, sum(self._totals))
+            with self._lock:
+                self._counts[stage] = n_done, n_frames
+                self._job.report(*map(sum, zip(*self._counts, strict=True)))
 
         return report
 
@@ -207,17 +208,19 @@ def _each_by_itself(
 ) -> Motion:
     """Return the motion of a scene with the self-collisions of each body resolved.
 
-    Most collisions are within one body, and alone it is cheaper to decode, search and solve. After
-    a stop the remaining bodies stay unchanged.
+    Most collisions are within one body, and alone it is cheaper to decode, search and solve. Bodies
+    that a stop leaves unchecked stay unchanged.
     """
     motion, options, space_at = run.motion, run.options, run.motion.space_at
     codes = np.array(motion.codes)
-    for number, body in enumerate(bodies):
+
+    def resolve(number: int) -> None:
+        body = bodies[number]
         own, feet = body.space_in, body.own_domains(options.feet)
         of_body = replace(
             motion,
             codes=motion.codes[:, body.codes],
-            space_at=None if space_at is None else lambda time, own=own: own(space_at(time)),  # type: ignore[misc]
+            space_at=None if space_at is None else lambda time: own(space_at(time)),
         )
         of_options = replace(
             options,
@@ -240,8 +243,12 @@ def _each_by_itself(
         except CancelledError:
             if run.job.cancelled:
                 raise
-            break
+            return
         codes[:, body.codes] = resolved.motion.codes
+
+    with ThreadPoolExecutor(workers or available_cores(), "bodies of a motion") as pool:
+        for _ in pool.map(resolve, range(len(bodies))):
+            pass
     return replace(motion, codes=codes)
 
 
