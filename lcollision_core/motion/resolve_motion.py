@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -562,19 +563,11 @@ class _Resolution:
         near = before[1] if before is not None and not was_free[0] else None
         freed = self.freed[span] = {}
         fractions = [_fractions(self.substeps[at]) for at in self._own(window)]
-        solutions: list[
-            tuple[tuple[int, float, int, float], FloatArray, npt.NDArray[np.bool_]]
-        ] = []
-        few, every = knots_of(was_free, motion.in_frames(_SPACING)), np.ones_like(was_free)
-        solved: dict[int, FloatArray] = {}
-        # If few frames first do not free all, smoothly and near enough, go on with all of them from
-        # those that are free; then resolve each of them first.
-        ways = ((few, False), (every, True), (every, False))
-        for knots, keeps in ways[: 2 if few.all() else 3]:
-            if keeps and not solved:
-                continue
+
+        def solution(knots: npt.NDArray[np.bool_], begin: Mapping[int, FloatArray]) -> _Solution:
+            """Resolve the knots first, beginning from corrections that free some frames."""
             start, known = np.zeros((len(window), motion.codes.shape[1])), was_free.copy()
-            for at, correction in solved.items() if keeps else ():
+            for at, correction in begin.items():
                 start[at], known[at] = correction, True
             colliding = [[window.start + at for at in run if knots[at]] for run in runs(~known)]
             for frame, correction in chain_corrections(frames, colliding, near, freed).items():
@@ -593,21 +586,31 @@ class _Resolution:
                 tell,
             )
             try:
-                solution, free = program.solve()
+                corrections, free = program.solve()
             except CancelledError:
-                freed |= {window.start + at: moved for at, moved in program.so_far().items()}
+                freed.update({window.start + at: moved for at, moved in program.so_far().items()})
                 raise
-            far = self._too_far(window, solution)
-            worth = int((~free | far).sum()), *program.rank, program.cost(solution)
-            solutions.append((worth, solution, free))
-            is_jerky = program.is_jerky(solution)
-            if program.is_settled and not is_jerky and not far.any():
-                break
-            moved = program.is_free_now & ~was_free & ~far
-            solved = {} if is_jerky else {at: solution[at] for at in np.flatnonzero(moved).tolist()}
-        _, solution, free = min(solutions, key=lambda tried: tried[0])
+            far, is_jerky = self._too_far(window, corrections), program.is_jerky(corrections)
+            moved = program.is_free_now & ~was_free & ~far & (not is_jerky)
+            return _Solution(
+                corrections,
+                free,
+                {at: corrections[at] for at in np.flatnonzero(moved).tolist()},
+                program.is_settled and not is_jerky and not far.any(),
+                (int((~free | far).sum()), *program.rank, program.cost(corrections)),
+            )
+
+        few = knots_of(was_free, motion.in_frames(_SPACING))
+        every = np.ones_like(few)
+        # Few frames first; else all, from those that are free; else all, each resolved first.
+        solutions = [solution(few, {})]
+        if not solutions[0].is_good and solutions[0].freed:
+            solutions.append(solution(every, solutions[0].freed))
+        if not solutions[-1].is_good and not few.all():
+            solutions.append(solution(every, {}))
+        best = min(solutions, key=lambda solution: solution.worth)
         targets = motion.codes[window.start : window.stop]
-        return list(zip(_added(targets, solution), free.tolist(), strict=True))
+        return list(zip(_added(targets, best.corrections), best.is_free.tolist(), strict=True))
 
     def _too_far(self, window: range, corrections: FloatArray) -> npt.NDArray[np.bool_]:
         """Return (n,) which (n, D) corrections of a window exceed the largest change."""
@@ -770,6 +773,26 @@ class _Resolution:
             for run in colliding_spans(side, 0, None, self.is_cycle)
         ]
         return tuple(sorted(filter(None, spans), key=lambda one: one.frames))
+
+
+class _Solution(NamedTuple):
+    """Corrections of the frames of a window.
+
+    Attributes
+    ----------
+    corrections : (n, D)
+    is_free : (n,) whether each frame is free with them
+    freed : (D,) corrections of frames that another search can begin from, by place in the window
+    is_good : whether all frames are free, near enough and move smoothly
+    worth : sort key, less is better: the number of frames that are left or move too far, what
+        could not be freed, and the cost
+    """
+
+    corrections: FloatArray
+    is_free: npt.NDArray[np.bool_]
+    freed: dict[int, FloatArray]
+    is_good: bool
+    worth: tuple[int, float, int, float]
 
 
 class _ProgressShare:
