@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.compiled import compiled, compiled_part, compiled_sums
+from lcollision_core.compiled import compiled, compiled_part, compiled_sums, inlined
 
 Array = npt.NDArray[np.floating[Any]]
 Number = np.floating[Any]
@@ -104,17 +104,26 @@ def contact_field(
                 p = order[first + i]
                 for k in range(2):
                     sums = lanes[(6 + 8 * k) * BLOCK + i :: BLOCK]
-                    inverse = dtype(1.0) / (sums[0] + dtype(SOME))
-                    field[p, b, k, 0] = sums[0] / (sums[0] + dtype(FULL))
-                    field[p, b, k, 1] = sums[1] * inverse * dtype(UNITS[k, 1])
-                    for c in range(3):
-                        # Offsets and normals in the point's frame.
-                        f0, f1, f2 = frame[b, p, 0, c], frame[b, p, 1, c], frame[b, p, 2, c]
-                        offset = f0 * sums[2] + f1 * sums[3] + f2 * sums[4]
-                        field[p, b, k, 2 + c] = offset * inverse * dtype(UNITS[k, 2])
-                        field[p, b, k, 5 + c] = (
-                            f0 * sums[5] + f1 * sums[6] + f2 * sums[7]
-                        ) * inverse
+                    take_means(sums, frame[b, p], dtype(1.0 / RADII[k]), field[p, b, k])
+
+
+@inlined
+def take_means(sums: Array, frame: Array, per_length: Number, features: Array) -> None:
+    """Fill in a point's (8,) features for one radius, of which `per_length` is the inverse.
+
+    Parameters
+    ----------
+    sums : (8,) of weights, heights, offsets (3) and normals (3), in world axes
+    frame : (3, 3) of the point
+    """
+    dtype = frame.dtype.type
+    inverse = dtype(1.0) / (sums[0] + dtype(SOME))
+    features[0] = sums[0] / (sums[0] + dtype(FULL))
+    features[1] = sums[1] * inverse * per_length
+    for c in range(3):
+        f0, f1, f2 = frame[0, c], frame[1, c], frame[2, c]
+        features[2 + c] = (f0 * sums[2] + f1 * sums[3] + f2 * sums[4]) * inverse * per_length
+        features[5 + c] = (f0 * sums[5] + f1 * sums[6] + f2 * sums[7]) * inverse
 
 
 @compiled_part
@@ -146,6 +155,29 @@ def _find_near(
     return n_near
 
 
+@inlined
+def pair_weights(squared: Any, ahead: Any, dtype: Any) -> Any:
+    """Return a point's weights in another's field, with the inner and with the outer radius.
+
+    Parameters
+    ----------
+    squared : distance between them
+    ahead : signed distance of the point from the other's tangent plane
+    dtype : of both
+    """
+    zero, one, two = dtype(0.0), dtype(1.0), dtype(2.0)
+    s = (ahead + dtype(BEHIND)) * dtype(1.0 / FADE)
+    s = s if s > zero else zero
+    rest = one - s
+    rest = rest if rest > zero else zero
+    facing = (one - rest) * (one - rest) * (one + two * rest)
+    t = one - squared * dtype(STEEPNESS[0])
+    t = t if t > zero else zero
+    u = one - squared * dtype(STEEPNESS[1])
+    u = u if u > zero else zero
+    return facing * t * t * t, facing * u * u * u
+
+
 @compiled_sums
 def _add_near(
     near: npt.NDArray[np.uintp],
@@ -166,9 +198,6 @@ def _add_near(
         as the compiler could not tell that several do not overlap
     """
     dtype = ordered.dtype.type
-    zero, one, two = dtype(0.0), dtype(1.0), dtype(2.0)
-    behind, sharpness = dtype(BEHIND), dtype(1.0 / FADE)
-    inner, outer = dtype(STEEPNESS[0]), dtype(STEEPNESS[1])
     for n in range(len(near)):
         q = near[n]
         x, y, z = ordered[0, q], ordered[1, q], ordered[2, q]
@@ -179,15 +208,8 @@ def _add_near(
             ahead = (
                 dx * lanes[3 * BLOCK + i] + dy * lanes[4 * BLOCK + i] + dz * lanes[5 * BLOCK + i]
             )
-            s = (ahead + behind) * sharpness
-            s = s if s > zero else zero
-            rest = one - s
-            rest = rest if rest > zero else zero
-            facing = (one - rest) * (one - rest) * (one + two * rest)
+            weight, outer_weight = pair_weights(squared, ahead, dtype)
             above = dx * nx + dy * ny + dz * nz
-            t = one - squared * inner
-            t = t if t > zero else zero
-            weight = facing * t * t * t
             lanes[6 * BLOCK + i] += weight
             lanes[7 * BLOCK + i] -= weight * above
             lanes[8 * BLOCK + i] += weight * dx
@@ -196,9 +218,7 @@ def _add_near(
             lanes[11 * BLOCK + i] += weight * nx
             lanes[12 * BLOCK + i] += weight * ny
             lanes[13 * BLOCK + i] += weight * nz
-            t = one - squared * outer
-            t = t if t > zero else zero
-            weight = facing * t * t * t
+            weight = outer_weight
             lanes[14 * BLOCK + i] += weight
             lanes[15 * BLOCK + i] -= weight * above
             lanes[16 * BLOCK + i] += weight * dx
@@ -556,15 +576,22 @@ def deform(features: Array, turns: Array, rest_frame: Array, frame: Array, rows:
     """
     for b in range(features.shape[0]):
         for q in range(features.shape[1]):
-            turn = _rotation(features[b, q], turns[:, b, q])
-            stretch = _symmetric(features[b, q])
-            for i in range(3):
-                for j in range(3):
-                    (r0, r1, r2), (s0, s1, s2) = turn[i], stretch[j]
-                    rows[b, i, q, j] = r0 * s0 + r1 * s1 + r2 * s2
-                    if q < len(rest_frame):
-                        s0, s1, s2 = rest_frame[q, 0, j], rest_frame[q, 1, j], rest_frame[q, 2, j]
-                        frame[b, q, i, j] = r0 * s0 + r1 * s1 + r2 * s2
+            deform_point(features[b, q], turns[:, b, q], rest_frame, q, frame[b], rows[b])
+
+
+@inlined
+def deform_point(
+    features: Array, turn: Array, rest_frame: Array, q: int, frame: Array, rows: Array
+) -> None:
+    """Do `deform` for point q of one pose."""
+    rotation, stretch = _rotation(features, turn), _symmetric(features)
+    for i in range(3):
+        for j in range(3):
+            (r0, r1, r2), (s0, s1, s2) = rotation[i], stretch[j]
+            rows[i, q, j] = r0 * s0 + r1 * s1 + r2 * s2
+            if q < len(rest_frame):
+                s0, s1, s2 = rest_frame[q, 0, j], rest_frame[q, 1, j], rest_frame[q, 2, j]
+                frame[q, i, j] = r0 * s0 + r1 * s1 + r2 * s2
 
 
 @compiled
@@ -641,15 +668,21 @@ def fold_view(frame: Array, rows: Array, members: npt.NDArray[np.int32], inputs:
     """Fill in (S, B, 9 M): the members' gradients in the frame of each site's first member."""
     for b in range(frame.shape[0]):
         for s in range(members.shape[0]):
-            q = members[s, 0]
-            for i in range(3):
-                f0, f1, f2 = frame[b, q, 0, i], frame[b, q, 1, i], frame[b, q, 2, i]
-                for m in range(members.shape[1]):
-                    p = members[s, m]
-                    for j in range(3):
-                        inputs[s, b, 9 * m + 3 * i + j] = (
-                            f0 * rows[b, 0, p, j] + f1 * rows[b, 1, p, j] + f2 * rows[b, 2, p, j]
-                        )
+            view_site(frame[b], rows[b], members[s], inputs[s, b])
+
+
+@inlined
+def view_site(frame: Array, rows: Array, members: npt.NDArray[np.int32], inputs: Array) -> None:
+    """Fill in the (9 M,) inputs of a site of one pose, see `fold_view`."""
+    q = members[0]
+    for i in range(3):
+        f0, f1, f2 = frame[q, 0, i], frame[q, 1, i], frame[q, 2, i]
+        for m in range(len(members)):
+            p = members[m]
+            for j in range(3):
+                inputs[9 * m + 3 * i + j] = (
+                    f0 * rows[0, p, j] + f1 * rows[1, p, j] + f2 * rows[2, p, j]
+                )
 
 
 @compiled
