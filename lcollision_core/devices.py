@@ -61,7 +61,7 @@ def uses_gpu(n_poses: int, n_faces: int) -> bool:
     """Whether a batch of this size is checked on a GPU."""
     if _Choice.device is Device.CPU or n_poses < _LEAST_POSES:
         return False
-    if not _Choice.in_use and n_poses * n_faces >= _WORTHWHILE and _has_extra() and _has_gpu():
+    if not _Choice.in_use and n_poses * n_faces >= _WORTHWHILE and has_gpu_kernels():
         _Choice.in_use = True
         _Choice.note("checking batches of poses on the GPU; use --device cpu to avoid it")
     return _Choice.in_use
@@ -72,6 +72,11 @@ def block_size(n_poses: int, n_faces: int, otherwise: int) -> int:
     if not uses_gpu(n_poses, n_faces):
         return otherwise
     return max(_FEWEST_POSES, min(_MOST_POSES, _MOST_FACES // n_faces))
+
+
+def has_gpu_kernels() -> bool:
+    """Whether compiled kernels run on a GPU: there is one, and the extra is installed."""
+    return _has_extra() and _has_gpu()
 
 
 def _require_cuda() -> None:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import scipy
 from msgspec import Meta
 
+from lcollision_core.devices import has_gpu_kernels
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.json_values import from_json, quoted
@@ -24,6 +25,7 @@ from lcollision_core.predictor.metrics import KindScores, PredictorMetrics
 from lcollision_core.predictor.stored_network import require_network
 
 if TYPE_CHECKING:
+    from lcollision_core.predictor.gpu_graph import ReplayedNetwork
     from lcollision_core.predictor.network_base import PredictorNetwork
 
 BATCH_ROWS = 500
@@ -234,8 +236,12 @@ class CollisionPredictor:
         ShapeError : another shape, or a number that is not finite.
         """
         codes = np.ascontiguousarray(self._checked(latent), dtype=np.float32)
-        compute = self._torch_outputs if self._compiled is None else self._compiled.outputs
-        domain_energy, logit = compute(codes)
+        if self._compiled is not None:
+            domain_energy, logit = self._compiled.outputs(codes)
+        elif runs_as_graph(self.config, self.device):
+            domain_energy, logit = self._replayed.outputs(codes)
+        else:
+            domain_energy, logit = self._torch_outputs(codes)
         return domain_energy, logit + self.facts.logit_shift
 
     def _torch_outputs(self, codes: npt.NDArray[np.float32]) -> tuple[FloatArray, FloatArray]:
@@ -328,7 +334,7 @@ class CollisionPredictor:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        networks = ("_compiled", "_network", "_exact_network")
+        networks = ("_compiled", "_network", "_exact_network", "_replayed")
         return {name: value for name, value in vars(self).items() if name not in networks}
 
     @cached_property
@@ -351,6 +357,12 @@ class CollisionPredictor:
         return self.network().to(self.device)
 
     @cached_property
+    def _replayed(self) -> ReplayedNetwork:
+        from lcollision_core.predictor.gpu_graph import ReplayedNetwork
+
+        return ReplayedNetwork(self._network, BATCH_ROWS)
+
+    @cached_property
     def _exact_network(self) -> PredictorNetwork:
         """The network in double precision, which solvers need close to their solution."""
         from copy import deepcopy
@@ -366,6 +378,14 @@ class CollisionPredictor:
         if not np.isfinite(codes).all():
             raise ShapeError("a latent pose contains NaN or infinity")
         return codes
+
+
+def runs_as_graph(config: PredictorConfig, device: str) -> bool:
+    """Whether a network runs as a CUDA graph, with its inputs by our kernels: `gpu_inputs`.
+
+    Otherwise torch computes everything on a GPU, operation by operation.
+    """
+    return device == "cuda" and config.preset != "paper" and has_gpu_kernels()
 
 
 def network_of(preset: str) -> type[PredictorNetwork]:

@@ -6,9 +6,10 @@ import hashlib
 import math
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -35,7 +36,12 @@ from lcollision_core.predictor.config import (
 from lcollision_core.predictor.geometric_network import FoldDetector
 from lcollision_core.predictor.metrics import error_rates
 from lcollision_core.predictor.network_base import PredictorNetwork, SkinCells, Targets
-from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts, network_of
+from lcollision_core.predictor.predictor import (
+    BATCH_ROWS,
+    TrainingFacts,
+    network_of,
+    runs_as_graph,
+)
 
 
 @dataclass(frozen=True)
@@ -311,7 +317,10 @@ class TrainingLoop:
         )
         network = network.to(processes.device)
         learnt = [values for values in network.parameters() if values.requires_grad]
-        optimiser = torch.optim.Adam(learnt, lr=config.rate, fused=True)
+        as_graph = processes.count == 1 and runs_as_graph(config, processes.device.type)
+        # A graph reads the rate, which changes with every step, from memory.
+        rate = torch.tensor(config.rate, device=processes.device) if as_graph else config.rate
+        optimiser = torch.optim.Adam(learnt, lr=rate, fused=True, capturable=as_graph)
         if config.average_passes > 0.0:
             averaged_steps = config.average_passes * self._steps_an_epoch
             self._average = _averaged(network, min(self._averaged_every / averaged_steps, 1.0))
@@ -331,20 +340,18 @@ class TrainingLoop:
         self._preparing = None
         network.train()
         self._report(step)
+        take_step = partial(self._take_step, network, shared, optimiser, processes)
+        take_whole_step: Callable[..., Tensor] = take_step
+        if as_graph:
+            from lcollision_core.predictor.gpu_graph import Replayed
+
+            take_whole_step = Replayed(take_step)
         while step < self._total:
             latent, targets = batches.at(*divmod(step, self._steps_an_epoch))
-            part = processes.share(len(latent))
             for group in optimiser.param_groups:
-                group["lr"] = rate_at(step, self._total, config)
-            optimiser.zero_grad(set_to_none=True)
-            output = shared(latent[part[0] : part[1]])
-            loss = network.loss(output, targets, part, config, self.facts.margin)
-            # Processes average their gradients, but each has a share of the sum; and they wait for
-            # the gradient of every parameter, even of those that this loss leaves out.
-            outputs = (output.domain_energy, output.logit, *output.auxiliary)
-            idle = sum((0.0 * values.sum() for values in outputs), start=0.0 * loss)
-            torch.autograd.backward(loss * processes.count + idle)
-            optimiser.step()
+                _set_rate(group, rate_at(step, self._total, config))
+            is_whole = len(latent) == config.batch_rows
+            loss = (take_whole_step if is_whole else take_step)(latent, *targets)
             step += 1
             if step % _STEPS_BETWEEN_CLEARINGS == 0:
                 _clear_tiny_moments(optimiser)
@@ -357,6 +364,28 @@ class TrainingLoop:
                 )
             self._after_step(step, network, optimiser, checkpoint, processes)
         return network
+
+    def _take_step(
+        self,
+        network: PredictorNetwork,
+        shared: torch.nn.Module,
+        optimiser: torch.optim.Optimizer,
+        processes: Processes,
+        latent: torch.Tensor,
+        *targets: torch.Tensor,
+    ) -> torch.Tensor:
+        """Move the weights by a batch; return this process's share of its loss."""
+        part = processes.share(len(latent))
+        optimiser.zero_grad(set_to_none=True)
+        output = shared(latent[part[0] : part[1]])
+        loss = network.loss(output, Targets(*targets), part, self.config, self.facts.margin)
+        # Processes average their gradients, but each has a share of the sum; and they wait for
+        # the gradient of every parameter, even of those that this loss leaves out.
+        outputs = (output.domain_energy, output.logit, *output.auxiliary)
+        idle = sum((0.0 * values.sum() for values in outputs), start=0.0 * loss)
+        torch.autograd.backward(loss * processes.count + idle)
+        optimiser.step()
+        return loss.detach()
 
     def _patch_roots(
         self, network: PredictorNetwork, key: str, processes: Processes
@@ -581,6 +610,14 @@ def _clear_tiny_moments(optimiser: torch.optim.Optimizer) -> None:
         for name in ("exp_avg", "exp_avg_sq"):
             values = moments[name]
             values.masked_fill_(values.abs() < _TINY_MOMENT, 0.0)
+
+
+def _set_rate(group: dict[str, Any], rate: float) -> None:
+    """Set the step size of an optimiser's weights, in place if it is a tensor."""
+    if isinstance(group["lr"], torch.Tensor):
+        group["lr"].fill_(rate)
+    else:
+        group["lr"] = rate
 
 
 def rate_at(step: int, total: int, config: PredictorConfig) -> float:

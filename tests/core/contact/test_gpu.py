@@ -1,4 +1,4 @@
-"""The GPU check, with a GPU simulated by Numba; nothing else needs CUDA."""
+"""Checks and predictions on a GPU that Numba simulates; nothing else needs CUDA."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import MissingExtraError
 
-_TESTS = Path(__file__).with_name("simulated_gpu.py")
+_ROOMS = ("contact", "predictor")
 
 
 def _run(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -25,8 +25,9 @@ def _run(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def _test_on_simulated_gpu(marked: str) -> None:
-    words = ("-m", "pytest", "-q", "-n", "0", "-m", marked, str(_TESTS))
+def _test_on_simulated_gpu(room: str, marked: str) -> None:
+    tests = Path(__file__).parents[1] / room / "simulated_gpu.py"
+    words = ("-m", "pytest", "-q", "-n", "0", "-m", marked, str(tests))
     done = _run(*words, NUMBA_ENABLE_CUDASIM="1")
     assert done.returncode == 0, done.stdout
     assert "passed" in done.stdout
@@ -34,13 +35,15 @@ def _test_on_simulated_gpu(marked: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_gpu_finds_what_the_processor_finds() -> None:
-    _test_on_simulated_gpu("not slow")
+@pytest.mark.parametrize("room", _ROOMS)
+def test_a_gpu_finds_what_the_processor_finds(room: str) -> None:
+    _test_on_simulated_gpu(room, "not slow")
 
 
 @pytest.mark.slow
-def test_a_gpu_finds_what_the_processor_finds_by_each_rule_and_at_random() -> None:
-    _test_on_simulated_gpu("slow")
+@pytest.mark.parametrize("room", _ROOMS)
+def test_a_gpu_finds_what_the_processor_finds_in_long_tests_too(room: str) -> None:
+    _test_on_simulated_gpu(room, "slow")
 
 
 def test_checking_many_poses_imports_nothing_of_cuda() -> None:
