@@ -382,6 +382,11 @@ class _Resolution:
             todo = [span for span in spans if np.isin(touching, np.asarray(span) % self.n).any()]
         if not self._is_stopped:
             self._soften()
+        return self._resolved(tuple(touching.tolist()) if self.options.continuous else None)
+
+    def _resolved(self, touching: tuple[int, ...] | None = None) -> ResolvedMotion:
+        """Return the current state as a result."""
+        again = np.arange(len(self.motion)) % self.n
         for span in runs(self.is_changed):
             if np.array_equal(
                 self.codes[span.start : span.stop], self.motion.codes[self._own(span)]
@@ -393,18 +398,32 @@ class _Resolution:
             self.after[again],
             tuple(runs(self.is_changed[again])),
             self.standing,
-            tuple(touching.tolist()) if self.options.continuous else None,
+            touching,
             tuple(self.unfinished),
             self._kept(),
         )
 
     def judged(self, other: ResolvedMotion) -> ResolvedMotion | None:
-        """Return another result for the motion; None if it makes a frame worse."""
-        codes, after = other.motion.codes, other.after[: self.n].copy()
-        if self.guard.faults(range(self.n), codes[: self.n], after, self._fractions):
+        """Return another result for the motion; None if it makes a frame worse.
+
+        After a stop, only the frames that it makes worse stay as they were.
+        """
+        codes, after = other.motion.codes[: self.n], other.after[: self.n].copy()
+        moved = (codes != self.motion.codes[: self.n]).any(axis=1)
+        faults = self.guard.faults(range(self.n), codes, after, self._fractions)
+        if not faults:
+            spans = tuple(runs((other.motion.codes != self.motion.codes).any(axis=1)))
+            return replace(other, before=self.before, spans=spans, standing=self.standing)
+        if not self._is_stopped:
             return None
-        spans = tuple(runs((codes != self.motion.codes).any(axis=1)))
-        return replace(other, before=self.before, spans=spans, standing=self.standing)
+        moved[list(faults)] = False
+        for span in runs(moved | np.isin(np.arange(self.n), list(faults))):
+            places = [at for at in span if moved[at] and after[at]]
+            self._fit(span, {at - span.start: codes[at] - self.motion.codes[at] for at in places})
+        left = self.wanted & ~(self.after & self._is_moved)
+        self._bar(np.flatnonzero(left), Reason.STOPPED)
+        self.unfinished += runs(left)
+        return self._resolved()
 
     @property
     def _is_stopped(self) -> bool:

@@ -63,3 +63,25 @@ def test_no_frame_has_more_pairs_where_bodies_meet() -> None:
     assert all(new <= old for old, new in zip(before, after, strict=True))
     assert [n == 0 for n in after] == result.after.tolist()
     assert [n == 0 for n in before] == result.before.tolist()
+
+
+def test_a_stop_keeps_what_was_freed_in_each_body() -> None:
+    body, motion = _scene(1.0)
+    motion = motion.part(range(3, 14))
+    stop, totals = Job(), list[int]()
+
+    def report(_: int, n_frames: int) -> None:
+        totals.append(n_frames)
+        # Both bodies have as many frames to resolve; more are of both together.
+        if n_frames > 2 * totals[0]:
+            stop.cancel()
+
+    result = resolve_motion(body.resolver, motion, body.up, job=Job(report), stop=stop)
+    assert stop.cancelled
+    assert result.unfinished
+    pairs = [
+        [_pairs(body, of, frame) for frame in range(len(motion))] for of in (motion, result.motion)
+    ]
+    assert [n == 0 for n in pairs[1]] == result.after.tolist()
+    assert result.before.sum() < result.after.sum() < len(motion)
+    assert all(new <= old for old, new in zip(*pairs, strict=True))
