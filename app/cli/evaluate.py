@@ -128,7 +128,7 @@ def evaluate(
         return
     called = "" if threshold == 0.5 else f", decision threshold {threshold:g}"
     scores = scores_text(asdict(metrics), metrics.samples)
-    tell(f"{model.name}, preset {trained.config.preset}{called}: {scores}")
+    tell(f"{model.name}, preset {trained.config.described}{called}: {scores}")
     tell(
         f"  {measured_model_sentence(model)}; {_percent(rows.colliding.mean())} of these "
         f"{counted(len(rows), 'sample')} collide"

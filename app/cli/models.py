@@ -304,6 +304,7 @@ def _describe_predictor(model: Body) -> dict[str, Any] | None:
     metrics = None if record.metrics is None else asdict(record.metrics)
     return {
         "preset": record.config.preset,
+        "training": asdict(record.config),
         "rows": facts.rows,
         "colliding_share": facts.colliding_share,
         "seed": facts.seed,
@@ -315,14 +316,17 @@ def _describe_predictor(model: Body) -> dict[str, Any] | None:
 
 def _predictor_sentence(report: dict[str, Any]) -> str:
     """Describe the predictor in a report of `describe`."""
+    from lcollision_core.predictor import PredictorConfig
+
     predictor = report["predictor"]
     if predictor is None:
         return "no predictor yet; `lcollision label` and `lcollision train predictor` add one"
     metrics = predictor["metrics"]
+    described = PredictorConfig(**predictor["training"]).described
     if metrics is None:
-        return f"predictor {predictor['preset']}, not measured"
+        return f"predictor {described}, not measured"
     scores, n_rows = scores_text(metrics), predictor["rows"]
-    return f"predictor {predictor['preset']}, of {n_rows} labelled samples: {scores}"
+    return f"predictor {described}, of {n_rows} labelled samples: {scores}"
 
 
 def _size_sentence(report: dict[str, Any]) -> str:

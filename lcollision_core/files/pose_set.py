@@ -360,7 +360,7 @@ def require_usable_reference(poses: PoseSet) -> None:
     if len(flat):
         face = int(flat[0])
         raise PoseSetError(
-            f"cannot be used: {len(flat)} faces of the reference, pose 0 ({poses.names[0]}), "
+            f"cannot be used: {len(flat)} faces of the reference, {_numbered(poses, 0)}, "
             f"have no area, the first is face {face} between vertices "
             f"{poses.faces[face].tolist()}",
             "remove them from all poses",
@@ -430,8 +430,8 @@ def _too_far_to_compute(where: str, vertices: npt.NDArray[Any]) -> PoseSetError 
     if vertex is None:
         return None
     what = (
-        f"has vertex {vertex} (from 0) at {vertices[vertex].tolist()}, which is not finite or "
-        f"beyond {LARGEST_COORDINATE:g}"
+        f"has vertex {vertex} (from 0) at ({', '.join(f'{x:g}' for x in vertices[vertex])}), which "
+        f"is not finite or beyond {LARGEST_COORDINATE:g}"
     )
     return PoseSetError(what, "remove or scale that pose", where=where)
 
@@ -599,13 +599,19 @@ def _collect_npz(
     return PoseSetInspection(usable, len(vertices), same_topology=True)
 
 
+def _numbered(poses: PoseSet, pose: int) -> str:
+    """Return a pose's number from 0, and its name if that says more."""
+    number, name = f"pose {pose}", poses.names[pose]
+    return number if name == number else f"{number} ({name})"
+
+
 def _usable(
     poses: PoseSet, report: Callable[[LCollisionError], None], *, is_rounded: bool = False
 ) -> PoseSet | None:
     """Return the poses that can be computed with; check how coarse they are if rounded."""
     kept = []
     for pose, vertices in enumerate(poses.vertices):
-        where = f"pose {pose} ({poses.names[pose]}) of {poses.source}"
+        where = f"{_numbered(poses, pose)} of {poses.source}"
         if (too_far := _too_far_to_compute(where, vertices)) is not None:
             report(too_far)
         elif is_rounded and (coarseness := coarseness_of(vertices, poses.topology)):
@@ -867,7 +873,7 @@ def inspect_pose_set(
     poses = collect_poses(Path(path), defects.append, job)
     problems = [str(defect) for defect in defects]
     if poses.pose_set is not None:
-        where = f"pose 0 ({poses.pose_set.names[0]})"
+        where = _numbered(poses.pose_set, 0)
         reference = audit_mesh(poses.pose_set.topology, poses.pose_set.vertices[0])
         problems += [f"{where}: {problem}" for problem in reference]
     return replace(poses, defects=tuple(defects), problems=tuple(problems))

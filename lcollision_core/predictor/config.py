@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import LCollisionError
+from lcollision_core.errors import LCollisionError, listed
 from lcollision_core.labels import measures
 from lcollision_core.options import Limits, SampleDistribution, require_limits
 
@@ -74,6 +74,18 @@ class PredictorConfig:
         if self.shown_rows is None:
             return self.epochs
         return min(self.epochs, max(LEAST_PASSES, -(-self.shown_rows // n_rows)))
+
+    @property
+    def described(self) -> str:
+        """The preset, and what was left out of it."""
+        usual = PRESETS[self.preset]
+        parts = {
+            "domains": not self.by_domain,
+            "the depth loss": self.depth_weight < usual.depth_weight,
+            "the ranking loss": self.rank_weight < usual.rank_weight,
+        }
+        left_out = listed([part for part, is_left_out in parts.items() if is_left_out])
+        return f"{self.preset} without {left_out}" if left_out else self.preset
 
     def with_loss(self, loss: Loss) -> PredictorConfig:
         """Return the same options without some of the loss's terms.

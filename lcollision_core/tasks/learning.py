@@ -506,6 +506,7 @@ def learn_latent_space(
     provenance = {
         "program": f"lcollision {version('lcollision')}",
         "poses_sha256": digest,
+        "training": asdict(config),
         **({"poses": dict(poses.provenance)} if poses.provenance else {}),
         **facts,
     }

@@ -105,6 +105,7 @@ def test_info_prints_what_scripts_read(lcollision: Lcollision, tube: Path) -> No
     assert report["masks"]["connected_share"] > 0.95
     assert 1 <= report["masks"]["domains_per_vertex"] <= 2
     assert report["provenance"]["seed"] == 1
+    assert report["provenance"]["training"]["encoded_codes"] is False
     assert report["provenance"]["poses"] == {"by_rig": {"seed": 7}}
 
 

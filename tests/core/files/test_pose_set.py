@@ -364,7 +364,7 @@ def _with_nan() -> np.ndarray:
         ({"vertices": _poses(2), "faces": FACES[:0]}, "no faces"),
         ({"vertices": _poses(2), "faces": FACES + 1}, "face 1 names vertices"),
         ({"vertices": _poses(2), "faces": FACES - 1}, "face 0 names vertices"),
-        ({"vertices": _with_nan(), "faces": FACES}, r"pose 1 \(pose 1\) .* vertex 2 .* finite"),
+        ({"vertices": _with_nan(), "faces": FACES}, r"pose 1 of .* vertex 2 .* finite"),
         ({"vertices": _poses(2), "faces": FACES, "names": np.array(["a"])}, r"\(2,\) strings"),
         ({"vertices": _poses(2), "faces": FACES, "up_axis": np.array(3)}, "0, 1 or 2, got 3"),
         ({"vertices": _poses(2), "faces": FACES, "near_exclusion": np.array(-1.0)}, "got -1"),

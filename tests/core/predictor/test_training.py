@@ -150,6 +150,13 @@ def test_only_the_paper_s_losses_can_be_left_out(loss: Loss) -> None:
     assert PRESETS["default"].with_loss("full") == PRESETS["default"]
 
 
+def test_a_configuration_names_the_parts_left_out_of_its_preset() -> None:
+    assert PRESETS["default"].described == "default"
+    assert PRESETS["paper"].with_loss("no-rank").described == "paper without the ranking loss"
+    baseline = replace(PRESETS["paper"], by_domain=False).with_loss("entropy")
+    assert baseline.described == "paper without domains, the depth loss, the ranking loss"
+
+
 def test_many_rows_are_watched_a_few_at_a_time(tube_model: LearnedBody) -> None:
     sizes: list[int] = []
     hook = register_module_forward_pre_hook(
