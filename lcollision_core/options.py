@@ -832,7 +832,7 @@ class LearningRequest(RuleOptions):
         Option(
             "Time spent against accuracy: quick, 100 poses of a rig and 20 000 samples; good, 150 "
             "and 50 000, with errors of held-out poses; best, 300 and 340 000, with three times "
-            "the epochs of level 2.",
+            "the epochs of level 2 and a larger predictor.",
             choices=tuple(Quality),
         ),
     ] = Quality.GOOD

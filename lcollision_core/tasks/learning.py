@@ -71,8 +71,12 @@ EFFORTS = {
     ),
     Quality.GOOD: Effort(150, EmbeddingConfig(), 50_000, PRESETS["default"]),
     # Enough for the held-out rows to determine the decision threshold.
-    Quality.BEST: Effort(300, EmbeddingConfig(level2_epochs=60), 340_000, PRESETS["default"]),
+    Quality.BEST: Effort(300, EmbeddingConfig(level2_epochs=60), 340_000, PRESETS["large"]),
 }
+
+_PASS_SECONDS, _LARGE = 7e-4, 2.5
+"""Seconds to train a predictor with a row once, and the factor of the preset `large`."""
+
 
 
 _TRAINING_SHARE = 1.0 - 0.3 * BOX_ROWS / ROWS_PER_BLOCK
@@ -120,11 +124,14 @@ def estimated_seconds(
     colliding = colliding_share * rows
     again = (colliding + min(colliding, _FOLDED)) * row
     judged = 6e-6 * effort.n_judged * n_vertices * share
+    passes = _PASS_SECONDS * n_passes * share
+    if effort.predictor.preset == "large":
+        passes *= _LARGE
     return {
         Stage.POSES: 5.0 + 1e-5 * n_vertices * n_poses * share,
         Stage.LATENT_SPACE: 3.0 + _latent_space(effort, share) * n_vertices * n_poses,
         Stage.LABELS: effort.n_samples * MIXED_COST * row,
-        Stage.PREDICTOR: 10.0 + again + 7e-4 * n_passes * share + judged,
+        Stage.PREDICTOR: 10.0 + again + passes + judged,
     }
 
 
