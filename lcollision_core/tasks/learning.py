@@ -78,7 +78,6 @@ _PASS_SECONDS, _LARGE = 7e-4, 2.5
 """Seconds to train a predictor with a row once, and the factor of the preset `large`."""
 
 
-
 _TRAINING_SHARE = 1.0 - 0.3 * BOX_ROWS / ROWS_PER_BLOCK
 """Share of the labelled samples that train the predictor."""
 
