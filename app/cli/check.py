@@ -90,9 +90,9 @@ def check(
     chosen for it, so that what touches in its stored pose counts.
 
     With --clips, motions are checked: the clips of characters and other animated files, point
-    caches with their mesh beside them, and, with --body, BVH and VRMA files, poses, and .npz files
-    of SMPL, SMPL-H and SMPL-X (as of AMASS), whose body is the .npz file of that model. Exits with
-    0 if no mesh has collisions, with 1 if any has.
+    caches with their mesh beside them, and, with --body, BVH and VRMA files, point caches alone,
+    poses, pose sets, and .npz files of SMPL, SMPL-H and SMPL-X (as of AMASS), whose body is the
+    .npz file of that model. Exits with 0 if no mesh has collisions, with 1 if any has.
 
     With --clearance, faces collide as soon as they are nearer than that. Without a rest pose, faces
     joined by an edge, or by at most four clearances along the surface, count only if they

@@ -287,13 +287,21 @@ def measured_model_sentence(model: LearnedBody) -> str:
     return f"|Z_0| = {first}, |Z_k| = {each} for {counted(len(others), 'domain')}, {rule}"
 
 
-def note_if_beside(written: Path, destination: Path) -> None:
-    """Explain that a trained model was written to another path, if it was."""
+def note_where_written(written: Path, destination: Path) -> None:
+    """Explain that a trained model has another path than asked for, or hides a bundled model."""
+    from lcollision_core.bodies import user_models_folder
+    from lcollision_core.bundled import bundled_folder
+
     if written != destination:
         note(
             f"{destination} was replaced by another model during training and was left alone; the "
             f"trained model is {written}"
         )
+    if (
+        written.parent == user_models_folder()
+        and (bundled_folder("models") / written.name).is_file()
+    ):
+        note(f"{written.stem!r} now names this model; remove it to see the bundled one again")
 
 
 def _describe_predictor(model: Body) -> dict[str, Any] | None:

@@ -220,6 +220,8 @@ def resolve(
             refuse_given(context, ("joints",), "is for motions resolved here", "leave it out")
         model = with_joint_map(model, joints)
     model = model.with_options(rules).with_touching(may_touch)
+    if model.is_trained and not only_check:
+        model.require_predictor()
     options = replace(
         options,
         locked_domains=frozenset(_domain(model, name) for name in lock or ()) | model.fixed_domains,

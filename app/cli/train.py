@@ -13,7 +13,7 @@ import typer
 
 from app.cli.console import cancel_on_interrupt, note, progress_bar, status_bar
 from app.cli.evaluate import StoreArgument, kind_lines, open_store
-from app.cli.models import describe, error_sentence, measured_model_sentence, note_if_beside
+from app.cli.models import describe, error_sentence, measured_model_sentence, note_where_written
 from app.cli.options import takes_options
 from app.cli.shared_options import Axis, ModelArgument, ModelOutput, PoseSetArgument, RowsOption
 from lcollision_core.errors import CancelledError
@@ -113,7 +113,7 @@ def embedding(
             job=job,
         )
     written = save_trained(destination, before, model)
-    note_if_beside(written, destination)
+    note_where_written(written, destination)
     checkpoint.unlink(missing_ok=True)
     note(f"wrote {written}: {error_sentence(describe(model))}")
 
@@ -198,7 +198,7 @@ def predictor(
             learned = learned.with_scores(CARD_POSES, 0, job)
         written = save_trained(destination, before, model, learned.of)
         trained = learned.predictor
-        note_if_beside(written, destination)
+        note_where_written(written, destination)
         checkpoint.unlink(missing_ok=True)
         if trained.metrics is not None:
             scores = scores_text(asdict(trained.metrics), trained.metrics.samples)

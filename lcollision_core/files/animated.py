@@ -71,7 +71,8 @@ def read_animated(
     fps : frames per second; None for the clip's keys, at most 30 per second. Not for point caches,
         whose frames are fixed.
     job : reports (frames done, all frames); polled between frames
-    topology : topology of another set of the same body, whose triangulation of polygons is used
+    topology : topology of another set of the same body, whose triangulation of polygons is used; a
+        point cache of as many vertices needs no mesh then, and its first frame is the rest pose
 
     Raises
     ------
@@ -167,16 +168,20 @@ def labels_of(scene: Scene, mesh: JoinedMesh) -> npt.NDArray[np.str_] | None:
 
 
 def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
-    """Read a point cache, with the mesh beside it as pose 0."""
+    """Read a point cache, with the mesh beside it, or its own first frame, as pose 0."""
     beside = [path.with_suffix(suffix) for suffix in READABLE_SUFFIXES]
     files = [file for file in beside if file.is_file()]
+    frames = read_point_cache(path)
+    names = ("rest", *(f"frame {frame}" for frame in range(len(frames))))
+    if not files and topology is not None and topology.n_vertices == frames.shape[1]:
+        vertices = np.concatenate([frames[:1], frames])
+        return AnimatedMesh(vertices, topology, names, (), None, None)
     if not files:
         raise MeshFileError(
             "is a point cache, which has no faces, and its mesh is not beside it",
             f"put it there as {beside[0].name}, or with another extension of a mesh",
             where=path,
         )
-    frames = read_point_cache(path)
     # Reordering to a topology, as for formats that split vertices, would not match the frames.
     is_plain = FILES[files[0].suffix.lower()].keeps_order
     mesh = read_mesh(files[0], topology=topology if is_plain else None)
@@ -196,7 +201,6 @@ def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
         )
     _require_same_body(path, files[0], mesh, frames[0].astype(np.float64))
     vertices = np.concatenate([mesh.vertices[None], frames])
-    names = ("rest", *(f"frame {frame}" for frame in range(len(frames))))
     notes = (f"{files[0].name} is its mesh and rest pose", *mesh.notes)
     return AnimatedMesh(vertices, mesh.topology, names, notes, _up_axis(scene), None)
 

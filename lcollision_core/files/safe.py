@@ -271,6 +271,7 @@ def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
     MeshFileError : `folder` cannot be created or written to.
     """
     target = Path(folder)
+    _require_parent(target, folder)
     is_new = not os.path.lexists(target)
     unfinished = target / f".{secrets.token_hex(6)}.part"
     try:
@@ -362,11 +363,16 @@ def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:
             require_regular(target)
     except OSError as error:
         raise MeshFileError.unwritable(path, error, "choose another name") from error
+    _require_parent(target, path)
+    return target
+
+
+def _require_parent(target: Path, path: str | os.PathLike[str]) -> None:
+    """Refuse a path, called `path` by the user, in a folder that does not exist."""
     if not target.parent.is_dir():
         raise MeshFileError.unwritable(
             path, f"there is no folder {target.parent}", "create it first"
         )
-    return target
 
 
 MAX_ITEMS = 1_000_000_000

@@ -100,9 +100,11 @@ def opened(
     suffix = Path(path).suffix.lower()
     with open_regular(path) as file:
         if suffix not in suffixes:
+            use = f"use one of {', '.join(suffixes)}"
+            if suffix == ".npz":
+                use += "; `lcollision dataset check` checks the poses of an .npz"
             raise MeshFileError(
-                f"{suffix or 'a name without extension'} is not a known {kind}",
-                f"use one of {', '.join(suffixes)}",
+                f"{suffix or 'a name without extension'} is not a known {kind}", use
             )
         if os.fstat(file.fileno()).st_size == 0:
             raise MeshFileError("it is empty")

@@ -17,6 +17,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from app.cli.main import app
+from app.cli.models import note_where_written
 from lcollision_core.bodies import (
     LearnedBody,
     NamedPose,
@@ -26,6 +27,7 @@ from lcollision_core.bodies import (
     open_body,
     read_poses,
     remember_choices,
+    user_models_folder,
     write_poses,
 )
 from lcollision_core.bundled import bundled_file
@@ -630,3 +632,11 @@ def test_glb_is_upright_whatever_is_up_in_the_model(
     assert lcollision("encode", turned, mesh, "-o", placed).exit_code == 0
     assert lcollision("decode", turned, placed, "-o", again).exit_code == 0
     assert read_mesh(again).vertices == pytest.approx(written, abs=1e-3 * model.body_size)
+
+
+def test_a_model_that_hides_a_bundled_one_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    for name, said in (("body", "'body' now names this model"), ("mine", "")):
+        path = user_models_folder() / f"{name}.safetensors"
+        note_where_written(path, path)
+        assert said in (text := capsys.readouterr().err)
+        assert bool(said) == bool(text)

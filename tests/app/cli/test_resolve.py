@@ -522,9 +522,13 @@ def test_a_model_without_a_predictor_is_refused(
 ) -> None:
     path = tmp_path / "bare.safetensors"
     LearnedBody(model.name, model.embedding, model.card).save(path)
-    result = lcollision("resolve", path, poses, "-o", tmp_path / "free.json")
-    assert result.exit_code == 2
-    assert "has no predictor" in result.stderr
+    mesh = tmp_path / "mesh.obj"
+    write_mesh(mesh, model.decode(model.known_poses[0]), model.faces)
+    for given in (poses, mesh):
+        result = lcollision("resolve", path, given, "-o", tmp_path / "free.json")
+        assert result.exit_code == 2
+        assert "has no predictor" in result.stderr
+        assert result.stderr.count("\n") == 1
 
 
 @pytest.mark.variants(2)

@@ -17,6 +17,7 @@ from lcollision_core.files import (
 )
 from lcollision_core.files.motion.caches import write_point_cache
 from lcollision_core.jobs import Job
+from lcollision_core.meshes import Topology
 from tests.core.gltf_builder import GltfBuilder, arm, rotation, tube
 
 
@@ -144,6 +145,10 @@ def test_a_point_cache_without_its_mesh_gets_a_sentence(tmp_path: Path) -> None:
     write_point_cache(path, vertices[None])
     with pytest.raises(MeshFileError, match=r"tube\.pc2 .*put it there as tube\.obj"):
         read_pose_set(path)
+    known = read_pose_set(path, topology=Topology(faces, len(vertices)))
+    np.testing.assert_allclose(known.vertices, [vertices, vertices], atol=1e-6)
+    with pytest.raises(MeshFileError, match="its mesh is not beside it"):
+        read_pose_set(path, topology=Topology(tube(5)[1], 32))
     write_mesh(tmp_path / "tube.obj", *tube(5))
     with pytest.raises(
         MeshFileError, match=r"holds 482 vertices per frame, its mesh tube\.obj has 32"

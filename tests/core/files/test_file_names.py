@@ -115,7 +115,7 @@ def test_a_folder_that_cannot_be_made_is_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for folder in (tmp_path / "file", tmp_path / "none" / "out", tmp_path / ("x" * 300)):
         with (
-            pytest.raises(MeshFileError, match=r"the folder .* cannot be written to: "),
+            pytest.raises(MeshFileError, match=r".* cannot be written"),
             atomic_files(folder),
         ):
             pass
