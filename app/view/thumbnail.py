@@ -22,7 +22,6 @@ _SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
 _FINENESS = 2
 """Dots per pixel along each axis, averaged to smooth the edges."""
 
-_MOST_CUTS = 10
 _AMBIENT = 0.42
 
 
@@ -64,17 +63,21 @@ def draw_pose(
     turned = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] > 0.0
     visible_faces = faces[turned]
     edges = np.abs(points[visible_faces] - points[np.roll(visible_faces, 1, axis=1)])[..., :2]
-    cuts = int(np.clip(math.ceil(np.quantile(edges, 0.98)) + 1, 1, _MOST_CUTS))
-    weights = _barycentric(cuts)
-    dots = np.einsum("wk,fkd->fwd", weights, points[visible_faces]).reshape(-1, 3)
-    shade = np.einsum("wk,fk->fw", weights, light[visible_faces]).ravel()
+    # Round up to powers of two, so that few sizes of triangles are drawn.
+    cuts = 2 ** np.ceil(np.log2(edges.max(axis=(1, 2)).clip(1.0, n_dots))).astype(np.intp)
+    parts = [np.zeros((0, 4))]
+    for count in np.unique(cuts):
+        of_size = visible_faces[cuts == count]
+        values = np.concatenate([points[of_size], light[of_size][..., None]], axis=2)
+        parts.append(np.einsum("wk,fkd->fwd", _barycentric(count), values).reshape(-1, 4))
+    dots, shade = np.split(np.concatenate(parts), [3], axis=1)
     order = np.argsort(dots[:, 2], kind="stable")
     columns = np.floor(0.5 * n_dots + dots[order, 0]).astype(np.intp)
     rows = np.floor(0.5 * n_dots - dots[order, 1]).astype(np.intp)
     inside = (columns >= 0) & (columns < n_dots) & (rows >= 0) & (rows < n_dots)
     # If several dots fall on one pixel, the last one written, the nearest, stays.
     picture = np.zeros((n_dots, n_dots, 4))
-    strength = (_AMBIENT + (1.0 - _AMBIENT) * shade[order])[inside, None]
+    strength = (_AMBIENT + (1.0 - _AMBIENT) * shade[order])[inside]
     picture[rows[inside], columns[inside], :3] = strength * np.array(colour)
     picture[rows[inside], columns[inside], 3] = 255.0
     blocks = picture.reshape(side, _FINENESS, side, _FINENESS, 4).sum(axis=(1, 3))
