@@ -12,6 +12,7 @@ from app.view.theme import CLOSE, NORMAL, TIGHT
 from app.window.dialogs.questions import Dialog
 from app.window.widgets import (
     Card,
+    ElidedLabel,
     ThemedIcon,
     described,
     labelled,
@@ -87,8 +88,8 @@ class JointsDialog(Dialog):
         grid.setVerticalSpacing(TIGHT)
         # Without this label, an empty column of signs has no spacing.
         grid.addWidget(labelled(""), 0, 0)
-        grid.addWidget(labelled(motion, "caption"), 0, 1)
-        grid.addWidget(labelled(body, "caption"), 0, 3, 1, 2)
+        grid.addWidget(_elided(motion), 0, 1)
+        grid.addWidget(_elided(body), 0, 3, 1, 2)
         for row, (joint, words) in enumerate(rows, 1):
             choice = _Choice(self._match.source_joints, self._match.followed[joint])
             self.choices[joint] = described(choice, "", f"Joint of the motion for {words or joint}")
@@ -98,8 +99,8 @@ class JointsDialog(Dialog):
                 grid.addWidget(sign, row, 0)
             grid.addWidget(choice, row, 1)
             grid.addWidget(labelled("→", "caption"), row, 2)
-            grid.addWidget(labelled(with_capital(words) or joint), row, 3)
-            grid.addWidget(labelled(joint if words else "", "caption"), row, 4)
+            grid.addWidget(labelled(with_capital(words)), row, 3)
+            grid.addWidget(_elided(joint), row, 4)
         for column, (width, stretch) in enumerate(_COLUMNS):
             grid.setColumnMinimumWidth(column, width)
             grid.setColumnStretch(column, stretch)
@@ -111,6 +112,13 @@ class JointsDialog(Dialog):
         partner_of_joint = {joint: choice.currentData() for joint, choice in self.choices.items()}
         super().accept()
         self.chosen.emit({**self._match.followed, **partner_of_joint})
+
+
+def _elided(name: str) -> ElidedLabel:
+    """Return a caption that takes no more width than its column has: names may be long."""
+    label = ElidedLabel(name, Qt.TextElideMode.ElideMiddle)
+    label.setObjectName("caption")
+    return label
 
 
 class _Choice(QComboBox):

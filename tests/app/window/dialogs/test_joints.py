@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PySide6.QtWidgets import QScrollArea
 from pytestqt.qtbot import QtBot
 
 from app.window.dialogs.joints import JointsDialog
 from app.window.main_window import MainWindow
+from lcollision_core.bodies.partners import JointMatch
 from tests.app.windows import PATIENCE, drop, rest
 from tests.core.bodies.test_clips import changed, strip
 
@@ -27,6 +29,22 @@ def renamed(source: Path, path: Path, names: dict[str, str]) -> Path:
             node["name"] = names.get(node.get("name", ""), f"a {node.get('name', '')}")
 
     return changed(source, path, change)
+
+
+def test_long_names_leave_room_for_all_columns(window: MainWindow) -> None:
+    joints = tuple(f"mixamorig:{'a very long name of joint ' * 3}{k}" for k in range(3))
+    match = JointMatch(
+        joints,
+        joints,
+        ("neck", "left elbow", ""),
+        dict(zip(joints, joints, strict=True)),
+        frozenset(),
+    )
+    dialog = JointsDialog(match, "A dance, retimed for the second act, final v12 " * 3, "b", window)
+    dialog.show()
+    (area,) = dialog.findChildren(QScrollArea)
+    assert area.widget().minimumSizeHint().width() <= area.viewport().width()
+    dialog.close()
 
 
 @pytest.mark.slow
