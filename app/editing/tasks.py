@@ -24,11 +24,11 @@ from lcollision_core.tasks.opening import OpenedModel, ReadPoses, examine, impor
 from lcollision_core.tasks.words import (
     counted,
     fit_error,
-    heading,
     height_text,
     mirrored_name,
     mirrored_text,
     say,
+    with_capital,
 )
 
 if TYPE_CHECKING:
@@ -590,7 +590,7 @@ class Tasks(QObject):
         if image.resolution is not None:
             after = replace(after, outcome_seconds=image.resolution.seconds)
         history.push("Mirror", after)
-        sentences = [heading(mirrored_text(image))]
+        sentences = [with_capital(mirrored_text(image))]
         if image.collides_newly and image.resolution is not None and image.resolution.note:
             sentences.append(image.resolution.note)
         if self._motion.locked_domains and not image.restored:

@@ -96,8 +96,9 @@ def grouped(number: int) -> str:
 
 
 def heading(name: str) -> str:
-    """Capitalise a domain's name as a heading."""
-    return name[:1].upper() + name[1:]
+    """Capitalise a domain's name as a heading, but not that of its body in a scene."""
+    body, colon, part = name.rpartition(": ")
+    return f"{body}{colon}{part[:1].upper()}{part[1:]}"
 
 
 def seconds_text(seconds: float) -> str:

@@ -30,7 +30,7 @@ from app.window.event_filters import Mnemonics
 from app.window.widgets import ThemedIcon, dialog_vbox, hbox, labelled, push_button, vbox
 from app.work.log import log_file
 from app.work.threads import Failure
-from lcollision_core.tasks.words import counted, heading, menu_text, one_line, say, with_capital
+from lcollision_core.tasks.words import counted, menu_text, one_line, say, with_capital
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -405,7 +405,7 @@ class NameDialog(QInputDialog):
         if not reason:
             super().accept()
             return
-        self.reason.setText(f"{heading(str(reason))}.")
+        self.reason.setText(f"{with_capital(str(reason))}.")
         self.reason.show()
         layout = self.layout()
         assert layout is not None

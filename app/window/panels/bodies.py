@@ -75,7 +75,7 @@ class BodiesPanel(QWidget):
         self._document = document
         self._hidden: set[str] = set()
         self._fingerprint = ""
-        self.tree = QTreeWidget()
+        self.tree = described(QTreeWidget(), "", "Bodies")
         self.tree.setHeaderLabels(_HEADER)
         # Names of similar bodies differ at their ends.
         self.tree.setTextElideMode(Qt.TextElideMode.ElideMiddle)
@@ -88,10 +88,11 @@ class BodiesPanel(QWidget):
         tip = "Save the scene: its files and their positions"
         self.save = push_button("Save scene…", tip)
         self.save.clicked.connect(self.save_wanted)
-        self.clip = described(QComboBox(), "Which of its clips the chosen body plays")
+        self.clip = described(QComboBox(), "Which of its clips the chosen body plays", "Clip")
         self.start = described(
             QDoubleSpinBox(suffix=" s", decimals=2, maximum=3600.0, singleStep=0.1),
             "When the clip of the chosen body begins",
+            "Start of the clip",
         )
         row = hbox(labelled("Plays"), self.clip, labelled("at"), self.start, spacing=TIGHT)
         self.playing = held(row)

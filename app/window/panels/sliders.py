@@ -243,7 +243,7 @@ class CodeRow(HoverRow):
         described(self.slider, plain_tip(tip), full)
         self.field.setAccessibleName(f"{full}, number")
         row = (self._label, self.slider, self.field)
-        line = hbox(*row, wide=self.slider, margins=(TIGHT, 0, TIGHT, 0))
+        line = hbox(*row, wide=self.slider, spacing=TIGHT, margins=(TIGHT, 0, TIGHT, 0))
         line.setStretchFactor(self._label, NAME_SHARE)
         self.setLayout(line)
         self.setFixedHeight(ROW_HEIGHT)
@@ -261,7 +261,7 @@ class CodeRow(HoverRow):
     @staticmethod
     def width_beside(name: int) -> int:
         """Return the least width of a row in which a name of this width is not elided."""
-        return name + LEAST_TRACK + _FIELD_WIDTH + _ARROWS_WIDTH + 2 * CLOSE + 2 * TIGHT
+        return name + LEAST_TRACK + _FIELD_WIDTH + _ARROWS_WIDTH + 4 * TIGHT
 
     def show_name(self, name: str, width: int) -> None:
         """Show a name, which takes this width before the slider grows beyond its minimum."""
@@ -471,7 +471,7 @@ class SliderGroup(QWidget):
         """Show the rows' names, without those of the bodies below captions that name these."""
         names = [row.name for row in self.rows]
         if self._captions and not names_bodies:
-            names = [heading(name.rpartition(": ")[2]) for name in names]
+            names = [name.rpartition(": ")[2] for name in names]
         width = longest_name(self, names)
         for row, name in zip(self.rows, names, strict=True):
             row.show_name(name, width)
@@ -486,7 +486,7 @@ class SliderGroup(QWidget):
         for index, code in enumerate(range(codes.start, codes.stop)):
             of_body, colon, _ = document.model.code_names[code].rpartition(": ")
             if names_bodies and colon and of_body != body:
-                body, caption = of_body, labelled(heading(of_body), "caption")
+                body, caption = of_body, labelled(of_body, "caption")
                 caption.setContentsMargins(TIGHT, TIGHT, 0, 0)
                 self._column.addWidget(caption)
                 self._captions.append(caption)
@@ -547,7 +547,7 @@ class SlidersPanel(QWidget):
         self._nothing = labelled("No matching sliders", "caption")
         self._nothing.setContentsMargins(TIGHT, TIGHT, TIGHT, TIGHT)
         self._nothing.hide()
-        self._column = vbox(self._nothing, None, spacing=2, margins=(CLOSE, 0, CLOSE, CLOSE))
+        self._column = vbox(self._nothing, None, spacing=2, margins=(CLOSE, 0, 0, CLOSE))
         self._page.setLayout(self._column)
         self._area = scrolling(self._page)
         self._bottom = vbox(margins=(NORMAL, 0, NORMAL, CLOSE))
@@ -630,7 +630,7 @@ class SlidersPanel(QWidget):
         """Return the width at which no name is elided."""
         name = longest_name(self, map(heading, self.document.model.code_names))
         bar = self._area.verticalScrollBar().sizeHint().width()
-        return CodeRow.width_beside(name) + 2 * CLOSE + bar
+        return CodeRow.width_beside(name) + CLOSE + bar
 
     def _on_latent(self) -> None:
         latent = self.document.history.latent

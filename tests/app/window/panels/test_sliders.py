@@ -17,6 +17,7 @@ from app.editing.document import PoseDocument
 from app.editing.history import Source
 from app.editing.live_pose import code_name
 from app.view.offscreen import VideoStyle
+from app.view.theme import TIGHT
 from app.window.main_window import MainWindow
 from app.window.panels.collision import DomainRow
 from app.window.panels.library import THUMBNAIL
@@ -33,6 +34,7 @@ from tests.app.windows import (
     open_window,
     rest,
     settings_in,
+    settle_layout,
 )
 from tests.core.bodies.test_shapes import face
 from tests.rigged_shapes import rigged_body
@@ -292,6 +294,17 @@ def test_what_can_be_typed_is_near_the_sliders_range(qtbot: QtBot, window: MainW
 
 def name_label(row: QWidget) -> QLabel:
     return next(label for label in row.findChildren(QLabel) if label.text())
+
+
+def test_a_narrow_panel_leaves_names_what_its_sliders_spare(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    row = window.sliders.row_of(0)
+    row.show_name("mouthLowerDownRight" * 3, 500)
+    window.resizeDocks([window.docks["sliders"]], [250], Qt.Orientation.Horizontal)
+    settle_layout(qtbot, window)
+    assert row.slider.width() == 60
+    assert name_label(row).width() == row.width() - 60 - row.field.width() - 4 * TIGHT
 
 
 @pytest.mark.slow
