@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import QSize, Qt, Slot
-from PySide6.QtWidgets import QProgressBar, QSizePolicy, QStatusBar, QToolBar, QToolButton, QWidget
+from html import escape
+
+from PySide6.QtCore import QPoint, QRect, QSize, Qt, Slot
+from PySide6.QtWidgets import (
+    QProgressBar,
+    QSizePolicy,
+    QStatusBar,
+    QToolBar,
+    QToolButton,
+    QToolTip,
+    QWidget,
+)
 
 from app.view.shading import Shading
 from app.view.theme import ICON_SIZE, NORMAL, Ring, give_icon
 from app.window.command import Commands
-from app.window.widgets import described, labelled
+from app.window.widgets import described, labelled, plain_tip
 from lcollision_core.tasks.words import one_line
 
-_MESSAGE_MILLISECONDS = 8000
+_MESSAGE_MILLISECONDS, _READING_MILLISECONDS = 8000, 60
+"""Shortest time of a message, and its time per character."""
+
+_FACTS_WIDTH = 300
 _RING_SIDE = 14
 
 
@@ -35,18 +48,26 @@ class StatusBar(QStatusBar):
         self.cancel = QToolButton()
         self.cancel.setText("Cancel export")
         self._facts = labelled("", "caption")
-        for widget in (self.busy, self._ring, self._bar, self.cancel, self._facts):
+        self._facts.setContentsMargins(NORMAL, 0, 0, 0)
+        self._permanent = (self.busy, self._ring, self._bar, self.cancel, self._facts)
+        for widget in self._permanent:
             self.addPermanentWidget(widget)
         self.setSizeGripEnabled(False)
         self.setContentsMargins(NORMAL, 0, NORMAL, 0)
-        # A long message is cut off.
         self.messageChanged.connect(self.setToolTip)
         self.show_busy("")
 
     @Slot(str)
     def tell(self, sentence: str) -> None:
-        """Show a message for some seconds."""
-        self.showMessage(one_line(sentence), _MESSAGE_MILLISECONDS)
+        """Show a message for as long as it takes to read, above the bar too if it is cut off."""
+        text = one_line(sentence)
+        duration = max(_MESSAGE_MILLISECONDS, _READING_MILLISECONDS * len(text))
+        self.showMessage(text, duration)
+        ends = [widget.x() for widget in self._permanent if widget.isVisible()]
+        if self.fontMetrics().horizontalAdvance(text) > min(ends, default=self.width()):
+            # Rich text wraps.
+            whole, corner = f"<span>{escape(text)}</span>", self.mapToGlobal(QPoint(0, 0))
+            QToolTip.showText(corner, whole, self, QRect(), duration)
 
     @Slot(str)
     def show_hint(self, hint: str) -> None:
@@ -59,7 +80,9 @@ class StatusBar(QStatusBar):
 
     def show_facts(self, facts: str) -> None:
         """Show facts about the model."""
-        self._facts.setText(one_line(facts))
+        text, middle = one_line(facts), Qt.TextElideMode.ElideMiddle
+        self._facts.setText(self.fontMetrics().elidedText(text, middle, _FACTS_WIDTH))
+        self._facts.setToolTip(plain_tip(text))
 
     def show_busy(self, work: str, *, may_cancel: bool = False) -> None:
         """Name the work in progress, "" for none; its progress may be shown later."""

@@ -46,12 +46,12 @@ from lcollision_core.tasks.words import (
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from app.editing.timeline import ResolveProgress
+    from app.editing.motion_resolve import ResolveProgress
 
 _SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0)
 _BUTTONS = ("colliding_before", "step_back", "play", "step_on", "colliding_next", "loop")
 _LARGEST_EASING = 1000
-_LEAST_WIDTH, _NARROW = 470, 650
+_LEAST_WIDTH, _NARROW = 410, 650
 _BAR_WIDTH, _PART_WIDTH = 64, 150
 _WHOLE_BODY = "Whole body"
 

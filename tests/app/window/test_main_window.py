@@ -6,6 +6,7 @@ import logging
 import re
 import threading
 from collections.abc import Iterator
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from PySide6.QtWidgets import (
     QLabel,
     QMessageBox,
     QProgressBar,
+    QToolTip,
     QWidget,
 )
 from pytestqt.qtbot import QtBot
@@ -225,6 +227,21 @@ def test_resolve_ends_exactly_free_and_undo_brings_the_old_mesh_back(
     rest(qtbot, window)
     assert shown(window).tobytes() == after.tobytes()
     assert outcome.exactly_free.answer is True
+
+
+def test_a_message_too_long_for_the_status_bar_is_shown_whole(window: MainWindow) -> None:
+    bar, long = window.statusBar(), "The wall is <thinner> than 1 mm in the left hand. " * 9
+    assert isinstance(bar, StatusBar)
+    bar.tell("Saved")
+    assert QToolTip.text() == ""
+    bar.tell(long)
+    assert bar.currentMessage() == long
+    assert QToolTip.text() == f"<span>{escape(long)}</span>"
+    QToolTip.hideText()
+    bar.show_facts("a name that does not end " * 9)
+    facts = next(label for label in bar.findChildren(QLabel) if "…" in label.text())
+    assert facts.width() < bar.width() / 3
+    assert facts.toolTip() == "a name that does not end " * 9
 
 
 def words_on_the_screen(window: MainWindow) -> Iterator[str]:

@@ -82,6 +82,16 @@ def test_everything_is_reached_at_800_by_600(qtbot: QtBot, small: MainWindow) ->
         assert lies_in(row.field, area.viewport())
 
 
+def test_the_smallest_window_shows_the_whole_timeline(qtbot: QtBot, small: MainWindow) -> None:
+    small.docks["timeline"].show()
+    small.docks["timeline"].raise_()
+    small.resize(1, 1)
+    settle_layout(qtbot, small)
+    assert lies_in(small.docks["timeline"], small)
+    for widget in (small.timeline.resolve, small.timeline.strip):
+        assert lies_in(widget, small.timeline)
+
+
 @pytest.mark.variants
 @pytest.mark.parametrize("shading", [Shading.DOMAINS, Shading.PREDICTED, Shading.EXACT])
 def test_the_note_of_the_legend_is_read_whole(
