@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,26 +14,26 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Qt, QTimer, Signal, Slot
 
 from app.editing.history import DocumentState, Moment
+from app.editing.motion_resolve import MotionResolve
 from app.editing.tasks import Work
 from app.work.frames import FrameCache, Onion
 from app.work.motion_checks import MotionChecks, check_motion, path_of_vertex
 from app.work.preparing import open_motions_to_show
 from app.work.threads import LongWork
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import Job
-from lcollision_core.tasks.editing import free_neighbours, resolve_frames
+from lcollision_core.tasks.editing import free_neighbours
 from lcollision_core.tasks.opening import OpenedModel, own_motions, read_motions
-from lcollision_core.tasks.words import counted, ground_text, joined, say, say_number
+from lcollision_core.tasks.words import counted, joined, say, with_capital
 
 if TYPE_CHECKING:
     from app.editing.history import PoseHistory
     from app.editing.live_pose import PoseMotion
     from app.editing.tasks import Tasks
     from app.work.frames import PoseFrame
-    from lcollision_core.bodies import Body
     from lcollision_core.bodies.partners import JointMap, JointMatch
     from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion, ResolvedMotion
+    from lcollision_core.motion.frames import KeptSpan
     from lcollision_core.options import MotionOptions
     from lcollision_core.tasks.opening import OpenedMotions
 
@@ -133,139 +133,6 @@ class Playback(QObject):
         elif frame == self._shown:
             return
         self.due.emit(frame)
-
-
-@dataclass(frozen=True)
-class ResolveProgress:
-    """The progress of a Resolve of a motion.
-
-    Attributes
-    ----------
-    began : when the colliding frames became known, before that its start; `time.monotonic`
-    done, total : frames of colliding spans; 0 of 0 until these are known
-    """
-
-    began: float
-    done: int = 0
-    total: int = 0
-
-    @property
-    def seconds(self) -> float:
-        """Seconds since `began`."""
-        return time.monotonic() - self.began
-
-    @property
-    def seconds_left(self) -> float | None:
-        """Estimated time for the rest; None until a frame is done."""
-        return self.seconds / self.done * (self.total - self.done) if self.done else None
-
-
-class MotionResolve(QObject):
-    """Resolves a motion in the long worker.
-
-    Parameters
-    ----------
-    parent : the Qt parent
-    tasks : run it
-
-    Attributes
-    ----------
-    progress : None unless a Resolve runs
-
-    Signals
-    -------
-    changed : `progress` is new
-    """
-
-    changed = Signal()
-
-    def __init__(self, parent: QObject, tasks: Tasks) -> None:
-        super().__init__(parent)
-        self._tasks = tasks
-        self.progress: ResolveProgress | None = None
-        self._solved: npt.NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
-        self._stop = Job()
-        tasks.motion_progressed.connect(self._on_progress)
-        tasks.busy_changed.connect(self._on_busy)
-
-    @property
-    def runs(self) -> bool:
-        """Whether a Resolve of a motion runs."""
-        return self._tasks.solving_motion
-
-    @property
-    def spans(self) -> tuple[range, ...]:
-        """The spans of frames that the running Resolve has freed so far."""
-        from lcollision_core.motion.motion import runs
-
-        return tuple(runs(self._solved)) if self.runs else ()
-
-    def start(
-        self,
-        model: Body,
-        motion: Motion,
-        options: MotionOptions,
-        within: range | None,
-        done: Callable[[ResolvedMotion], None],
-    ) -> None:
-        """Start a Resolve; the parameters are those of `resolve_frames` and `LongWork.start`."""
-        self._solved = np.zeros(len(motion), dtype=np.bool_)
-        self._stop = Job()
-        job = partial(resolve_frames, model, motion, options, within, self._solved, self._stop)
-        self._tasks.start(Work.RESOLVE_MOTION, f"Resolving {motion.name}", job, done)
-        self.progress = ResolveProgress(time.monotonic())
-        self.changed.emit()
-
-    @Slot()
-    def cancel(self) -> None:
-        """Cancel the Resolve; the motion stays as it was."""
-        self.end("Resolve was cancelled: the motion is as it was")
-
-    def end(self, why: str) -> None:
-        """Cancel the Resolve, with `why` as the message."""
-        if self.runs:
-            self._tasks.cancel(Work.RESOLVE_MOTION)
-            self._tasks.message.emit(why)
-
-    @Slot()
-    def keep_done(self) -> None:
-        """Stop soon, and keep the spans that are resolved by then."""
-        self._stop.cancel()
-        self.changed.emit()
-
-    @property
-    def is_ending(self) -> bool:
-        """Whether the Resolve was asked to stop: see `keep_done`."""
-        return self._stop.cancelled
-
-    def summary(self, found: ResolvedMotion, part_names: Sequence[str]) -> str:
-        """Summarise a result in one sentence."""
-        if self.is_ending and not found.spans:
-            return "Stopped before a span of frames was resolved: the motion is as it was"
-        if not found.spans and not found.kept:
-            return "No frame collides"
-        n_left, before = int((~found.after).sum()), counted(int((~found.before).sum()), "frame")
-        text = say("{frames} collided", frames=before)
-        if self.is_ending:
-            text = say("Stopped: {frames} collided", frames=before)
-        now = say_number(n_left, "{n} still does", "{n} still do") if n_left else "all are free now"
-        kept_sentences = (span.sentence(part_names) for span in found.kept)
-        ground = ground_text(None if found.ground is None else asdict(found.ground))
-        return joined((text, now, *kept_sentences, ground))
-
-    @Slot(int, int)
-    def _on_progress(self, done: int, total: int) -> None:
-        progress = self.progress
-        if progress is not None:
-            began = progress.began if progress.total else time.monotonic()
-            self.progress = ResolveProgress(began, done, total)
-            self.changed.emit()
-
-    @Slot()
-    def _on_busy(self) -> None:
-        if self.progress is not None and not self.runs:
-            self.progress = None
-            self.changed.emit()
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,6 +241,7 @@ class Timeline(QObject):
         self.comparing = self._waits = False
         self._motion: Motion | None = None
         self.resolving = MotionResolve(self, tasks)
+        self._kept: tuple[Motion | None, tuple[KeptSpan, ...]] = (None, ())
         self._edit: tuple[Motion, Motion] | None = None
         self._cache = FrameCache(self)
         self._cache.ready.connect(self._on_ready)
@@ -960,12 +828,27 @@ class Timeline(QObject):
             model, motion, motion_options, within, partial(self._on_resolved, motion)
         )
 
+    def kept_sentences(self, frame: int | None = None) -> list[str]:
+        """Say of each span that Resolve left colliding why, until the motion changes.
+
+        Parameters
+        ----------
+        frame : only of the span with this frame; of all if None
+        """
+        motion, kept = self._kept
+        if motion is None or self.motion is not motion or self.comparing:
+            return []
+        names = self._history.model.domain_names
+        spans = [span for span in kept if frame is None or frame in span]
+        return [with_capital(span.sentence(names)) for span in spans]
+
     def _on_resolved(self, asked: Motion, found: ResolvedMotion) -> None:
         history = self._history
         state = history.state
         if state.moment is None or state.motion is not asked:
             self.message.emit(_STOPPED)
             return
+        self._kept = found.motion if found.spans else asked, found.kept
         if found.spans:
             frame = state.moment.frame
             moment = Moment(found.motion, frame)

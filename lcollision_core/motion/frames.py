@@ -719,6 +719,11 @@ class KeptSpan:
     deepest: float = 0.0
     is_original: bool = True
 
+    def __contains__(self, frame: int) -> bool:
+        """Return whether a frame is one of these."""
+        first, last = self.frames
+        return first <= frame <= last if first <= last else frame >= first or frame <= last
+
     def to_json(self, part_names: Sequence[str]) -> dict[str, object]:
         """Return the values for reports, with body parts by name."""
         return {

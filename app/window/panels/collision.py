@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -322,6 +323,9 @@ class PredictionCard(PoseCard):
             row.hovered.connect(self.domain_hovered)
             row.menu_wanted.connect(self.menu_wanted)
             self._rows.addWidget(row)
+        order = [self.learn, *(self.rows[domain].lock for domain in model.domain_order)]
+        for before, after in pairwise(order):
+            QWidget.setTabOrder(before, after)
         predicts = self._document.model.has_predictor
         for widget in (self.meter, self.verdict, self.percent):
             widget.setVisible(predicts)
@@ -455,6 +459,7 @@ class ResolveCard(Card):
             NumberBox(2, 0.0, 100.0 * _LARGEST_CLEARANCE, strip_zeros=True),
             "Distance that Resolve and Solid keep between body parts; parts near at rest may "
             "come to half their rest distance",
+            "Clearance",
         )
         self._clearance_unit = 0.01
         clearance = hbox(labelled("Clearance"), None, self.clearance)
@@ -613,7 +618,7 @@ class OutcomeCard(Card):
         self._moved.setText("not at all" if result.latent_distance == 0.0 else unbroken(moved))
         self._moved.setToolTip("Mean and maximum over the mesh")
         self._took.setText(_times(result.seconds, self._document.history.state.outcome_seconds))
-        self._note.setText(heading(result.note or ""))
+        self._note.setText(with_capital(result.note or ""))
         self._note.setVisible(bool(result.note))
 
     def _checked(self, result: ResolveResult) -> str:
@@ -792,6 +797,7 @@ class ExactCard(PoseCard):
             sentences.append(_HELD)
         else:
             sentences.append("No other triangles cross" if left_out else "No triangles cross")
+        sentences += document.timeline.kept_sentences(document.timeline.frame)
         rules = document.model.rules
         if rules.left_out:
             sentences.append(with_capital(rules.left_out_in_words()))

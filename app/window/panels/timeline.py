@@ -356,7 +356,8 @@ class TimelinePanel(QWidget):
                 frames = say("{n} of {searched} searched", n=n, searched=left_out.searched)
             line = say("Not counted in {frames}, up to {depth}", frames=frames, depth=depth)
             text = f"{text}\n{line}"
-        self.facts.setText(text, left_out.sentence(self._document.model.rules))
+        more = [left_out.sentence(self._document.model.rules), *timeline.kept_sentences()]
+        self.facts.setText(text, "\n".join(filter(None, more)))
 
 
 def _button(action: QAction) -> QToolButton:

@@ -28,7 +28,8 @@ from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.meshes import contact_rules
-from lcollision_core.motion import MotionOptions
+from lcollision_core.motion import MotionOptions, ResolvedMotion
+from lcollision_core.motion.frames import KeptSpan, Reason
 from lcollision_core.tasks import exporting
 from tests.app.windows import (
     PATIENCE,
@@ -521,6 +522,32 @@ def test_a_resolve_shows_how_far_it_is_and_is_cancelled_where_it_was_begun(
     assert not panel.working.isVisible()
     assert any(words.startswith("0 of ") and words.endswith(" so far") for words in said)
     assert any(words.endswith(" frames, less than a minute left") for words in said)
+
+
+def test_why_frames_are_left_colliding_is_read_until_the_motion_changes(
+    qtbot: QtBot, swinging: MainWindow
+) -> None:
+    timeline, card = swinging.document.timeline, swinging.collision.exact
+    timeline.go_to(0)
+    motion, free = timeline.motion, timeline.checks.deepest == 0.0
+    assert motion is not None
+    left = np.flatnonzero(~free)
+    kept = KeptSpan((int(left[0]), int(left[-1])), Reason.TOO_FAR, ((1, 3),), 0.01)
+    standing = np.zeros((len(motion), 1), dtype=np.bool_)
+    timeline._on_resolved(motion, ResolvedMotion(motion, free, free, (), standing, kept=(kept,)))
+    (why,) = timeline.kept_sentences()
+    assert why.endswith("Torso and Left upper arm, 1.00 % deep; " + Reason.TOO_FAR)
+    assert why in swinging.timeline.facts.toolTip()
+    for frame, is_said in ((0, False), (int(left[0]), True), (len(motion) - 1, False)):
+        timeline.go_to(frame)
+        rest(qtbot, swinging)
+        assert (why in card.details.text().replace("\N{NO-BREAK SPACE}", " ")) is is_said
+    swinging.document.motion.set_code(0, 0.1)
+    rest(qtbot, swinging)
+    swinging.document.motion.end_gesture()
+    qtbot.waitUntil(lambda: timeline.kept_sentences() == [])
+    swinging.document.history.undo()
+    assert timeline.kept_sentences() == [why]
 
 
 @pytest.mark.slow

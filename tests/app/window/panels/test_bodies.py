@@ -11,8 +11,17 @@ import numpy.typing as npt
 import pytest
 import pyvista
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QImage
-from PySide6.QtWidgets import QDialog, QFileDialog, QLabel, QMessageBox, QToolButton
+from PySide6.QtGui import QAccessible, QImage
+from PySide6.QtWidgets import (
+    QAbstractSpinBox,
+    QDialog,
+    QFileDialog,
+    QLabel,
+    QMessageBox,
+    QTabBar,
+    QToolButton,
+    QWidget,
+)
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
@@ -73,14 +82,14 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
     whole_body = window.sliders.groups[0]
     whole_body.set_open(True)
     captions = [one.text() for one in whole_body.findChildren(QLabel) if not one.isHidden()]
-    assert [one for one in captions if one in ("Hero", "Hero 2")] == ["Hero", "Hero 2"]
+    assert [one for one in captions if one in ("hero", "hero 2")] == ["hero", "hero 2"]
     # The captions name the bodies; without them, while filtered, the rows do.
     names = [row.name for row in whole_body.rows]
-    assert names[0] == "Hero: move left"
+    assert names[0] == "hero: Move left"
     assert captions.count("Move left") == 2
     window.sliders.filter.setText("move left")
     shown = [one.text() for one in whole_body.findChildren(QLabel) if one.isVisible()]
-    assert shown == ["Whole body", "Hero: move left", "Hero 2: move left"]
+    assert shown == ["Whole body", "hero: Move left", "hero 2: Move left"]
     window.sliders.filter.clear()
     rows = [tree.topLevelItem(row) for row in range(tree.topLevelItemCount())]
     assert [row.text(0) for row in rows if row is not None] == ["hero", "hero 2"]
@@ -95,6 +104,20 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
         assert second is not None
         second.setCheckState(3, Qt.CheckState.Unchecked)
     assert document.model.rules.left_out == ("hero 2",)
+    # Screen readers read a name of everything that takes the focus.
+    for widget in window.findChildren(QWidget):
+        takes_focus = widget.focusPolicy() & Qt.FocusPolicy.TabFocus and widget.isVisible()
+        is_part = isinstance(widget.parentWidget(), QAbstractSpinBox)
+        if takes_focus and not (is_part or isinstance(widget, QTabBar)):
+            accessible = QAccessible.queryAccessibleInterface(widget)
+            assert accessible.text(QAccessible.Text.Name), (widget, widget.toolTip())
+    # Tab goes through the locks in their order, within the panel.
+    card = window.collision.prediction
+    expected = [card.rows[domain].lock for domain in document.model.domain_order]
+    chain = [card.learn]
+    while chain[-1] is not window.collision.resolve.button:
+        chain.append(chain[-1].nextInFocusChain())
+    assert [widget for widget in chain if widget in expected] == expected
 
 
 def test_another_body_that_is_dropped_joins_where_that_is_wanted(
