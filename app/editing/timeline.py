@@ -858,6 +858,7 @@ class Timeline(QObject):
             # Resolve has checked these frames exactly.
             self.checks.deepest[found.after & np.isnan(self.checks.deepest)] = 0.0
             self.checked.emit()
+        self.resolving.changed.emit()
         self.message.emit(self.resolving.summary(found, history.model.domain_names))
 
     def close(self, deadline: float) -> bool:

@@ -25,6 +25,9 @@ _MESSAGE_MILLISECONDS, _READING_MILLISECONDS = 8000, 60
 """Shortest time of a message, and its time per character."""
 
 _FACTS_WIDTH = 300
+
+_LINES = 9
+"""Lines above the bar at which a message that it cuts off begins."""
 _RING_SIDE = 14
 
 
@@ -65,9 +68,9 @@ class StatusBar(QStatusBar):
         self.showMessage(text, duration)
         ends = [widget.x() for widget in self._permanent if widget.isVisible()]
         if self.fontMetrics().horizontalAdvance(text) > min(ends, default=self.width()):
-            # Rich text wraps.
-            whole, corner = f"<span>{escape(text)}</span>", self.mapToGlobal(QPoint(0, 0))
-            QToolTip.showText(corner, whole, self, QRect(), duration)
+            whole = f"<span>{escape(text)}</span>"  # rich text wraps
+            above = QPoint(0, -_LINES * self.fontMetrics().height())
+            QToolTip.showText(self.mapToGlobal(above), whole, self, QRect(), duration)
 
     @Slot(str)
     def show_hint(self, hint: str) -> None:

@@ -706,6 +706,7 @@ class ExactCard(PoseCard):
         headline = hbox(self._sign, self.verdict, wide=self.verdict)
         self.add(title_row("Exact check", self.source), headline, self.details, self.nearest)
         document.motion.nearest_changed.connect(self._say_nearest)
+        document.timeline.resolving.changed.connect(self._on_resolve)
         self._on_model()
 
     @property
@@ -778,6 +779,13 @@ class ExactCard(PoseCard):
         faces = self._document.model.faces
         around = np.isin(faces, faces[nearest.faces]).any(axis=1)
         self.faces_selected.emit(np.flatnonzero(around))
+
+    @Slot()
+    def _on_resolve(self) -> None:
+        """Say why Resolve left the frame shown, which it has not changed."""
+        exact = self._document.motion.exact if self._document.has_model else None
+        if exact is not None and self._document.timeline.resolving.progress is None:
+            self._say(exact)
 
     def _say(self, verdict: SelfCollisions) -> None:
         document = self._document

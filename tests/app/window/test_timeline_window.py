@@ -528,17 +528,19 @@ def test_why_frames_are_left_colliding_is_read_until_the_motion_changes(
     qtbot: QtBot, swinging: MainWindow
 ) -> None:
     timeline, card = swinging.document.timeline, swinging.collision.exact
-    timeline.go_to(0)
     motion, free = timeline.motion, timeline.checks.deepest == 0.0
     assert motion is not None
     left = np.flatnonzero(~free)
+    timeline.go_to(int(left[0]))
+    rest(qtbot, swinging)
     kept = KeptSpan((int(left[0]), int(left[-1])), Reason.TOO_FAR, ((1, 3),), 0.01)
     standing = np.zeros((len(motion), 1), dtype=np.bool_)
     timeline._on_resolved(motion, ResolvedMotion(motion, free, free, (), standing, kept=(kept,)))
     (why,) = timeline.kept_sentences()
-    assert why.endswith("Torso and Left upper arm, 1.00 % deep; " + Reason.TOO_FAR)
+    names = swinging.document.model.domain_names
+    assert why.endswith(f": {names[1]} and {names[3]}, 1.00 % deep; {Reason.TOO_FAR}")
     assert why in swinging.timeline.facts.toolTip()
-    for frame, is_said in ((0, False), (int(left[0]), True), (len(motion) - 1, False)):
+    for frame, is_said in ((int(left[0]), True), (0, False), (int(left[-1]), True)):
         timeline.go_to(frame)
         rest(qtbot, swinging)
         assert (why in card.details.text().replace("\N{NO-BREAK SPACE}", " ")) is is_said
