@@ -7,6 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Each worker has one core, on which several threads would wait for each other. The variable is
@@ -14,11 +15,13 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
-from typer.testing import CliRunner, Result
 
-from app.cli.main import app
-from lcollision_core.files import PoseSet, read_pose_set
-from tests.app.support import Lcollision
+# The process that only starts the workers loads this file too, so other imports are in functions.
+if TYPE_CHECKING:
+    from typer.testing import Result
+
+    from lcollision_core.files import PoseSet
+    from tests.app.support import Lcollision
 
 UNPUBLISHED = {"characters", "scape", "jumping"}
 """Fixtures of data that is not redistributed: tests that use them are marked slow."""
@@ -65,6 +68,8 @@ def characters() -> Path:
 
 def _published_set(name: str) -> PoseSet:
     """Read a published pose set that may not be redistributed, or skip the test."""
+    from lcollision_core.files import read_pose_set
+
     default = Path(__file__).parents[2] / "shared" / "data"
     folder = Path(os.environ.get("LCOLLISION_DATA", default))
     path = folder / name
@@ -88,7 +93,6 @@ def jumping() -> PoseSet:
 @pytest.fixture(scope="module")
 def scheduler() -> Iterator[str]:
     """Return the address of a Dask scheduler with two worker processes."""
-    # Imported here, as only slow tests need it.
     from distributed import LocalCluster
 
     with LocalCluster(
@@ -100,6 +104,9 @@ def scheduler() -> Iterator[str]:
 @pytest.fixture(scope="session")
 def lcollision() -> Lcollision:
     """Run ``lcollision ARGUMENTS``; the result has exit_code, stdout and stderr."""
+    from typer.testing import CliRunner
+
+    from app.cli.main import app
 
     def run(*arguments: object) -> Result:
         result = CliRunner().invoke(app, [str(argument) for argument in arguments])

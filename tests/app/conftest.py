@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,8 +24,8 @@ from app.window.dialogs.questions import Choice
 from app.window.main_window import MainWindow
 from app.work.preparing import prepare, warm_up
 from lcollision_core.bodies import LearnedBody, find_model, sample_poses
-from lcollision_core.files import locked
 from lcollision_core.jobs import Job
+from tests.app.editor_model import tube_with_predictor
 from tests.app.support import STABBED
 from tests.app.views import SIDE, dispose, rest
 from tests.app.windows import (
@@ -120,21 +117,9 @@ def _releases_its_buttons() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def editor_model(tmp_path_factory: pytest.TempPathFactory) -> LearnedBody:
+def editor_model() -> LearnedBody:
     """Return a small model with a predictor, warmed up so that its frames need no compiling."""
-    folder = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        # All workers use the model that the first of them trains.
-        folder = folder.parent
-    path = folder / "editor" / "tube.safetensors"
-    path.parent.mkdir(exist_ok=True)
-    with locked(path, wait=PATIENCE / 1000):
-        if not path.exists():
-            # In a process without a window: triton and Mesa's LLVM crash in one.
-            code = "from tests.app.editor_model import trained_tube as make; make().save({!r})"
-            root = Path(__file__).parents[2]
-            subprocess.run([sys.executable, "-c", code.format(str(path))], cwd=root, check=True)
-    model = LearnedBody.load(path)
+    model = tube_with_predictor()
     warm_up(model)
     return model
 

@@ -7,19 +7,32 @@ from dataclasses import replace
 import numpy as np
 
 from lcollision_core.bodies import LearnedBody, user_models_folder
+from lcollision_core.predictor import PRESETS, CollisionPredictor, TrainingFacts, score_rows
+from lcollision_core.predictor.paper_network import PaperNetwork
 from tests.small_models import stored
 
 
-def trained_tube() -> LearnedBody:
-    """Return a model of a tube that bends at two joints, with two domains of three codes."""
-    from lcollision_core.predictor import PRESETS, train_predictor
+def tube_with_predictor() -> LearnedBody:
+    """Return a tube that bends at two joints; its predictor's weights are those before training.
 
+    Training would load triton, which crashes in a process where Mesa draws a window.
+    """
     bare = stored("editor_tube")
-    labeller = bare.labeller()
-    rows = labeller.label_rows(0, range(32))
-    # Averaged weights would lag behind after only two epochs.
-    quick = replace(PRESETS["paper"], epochs=2, average_passes=0.0)
-    predictor = train_predictor(rows, bare.embedding, quick)
+    embedding = bare.embedding
+    rows = bare.labeller().label_rows(0, range(32))
+    network = PaperNetwork(embedding.group_sizes, True, 0)
+    arrays = {name: values.numpy() for name, values in network.state_dict().items()}
+    facts = TrainingFacts(
+        rows=len(rows),
+        training_rows=len(rows),
+        colliding_share=float(rows.colliding.mean()),
+        seed=0,
+        energy_scale=float(rows.energy[rows.colliding].mean()),
+        margin=1.0,
+        store=None,
+    )
+    predictor = CollisionPredictor(embedding, arrays, PRESETS["paper"], facts)
+    predictor = replace(predictor, metrics=score_rows(predictor, rows).metrics())
     return bare.with_predictor(predictor)
 
 
