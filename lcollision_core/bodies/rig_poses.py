@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -265,31 +266,37 @@ class _Body:
         head = _turn(pose.lean[2] / n_head, -(pose.twist[0] + pose.twist[1]) / n_head, 0.0)
         more = {Role.SPINE: spine, Role.NECK: head, Role.HEAD: head}
         turns = np.empty((len(roles), 3, 3))
+        root = _turn(pose.lean[0], pose.twist[0], 0.0)
         for joint, parent in enumerate(self._space.rig.parents.tolist()):
-            turns[joint] = _turn(pose.lean[0], pose.twist[0], 0.0)
+            turn = root
             if parent >= 0:
-                places[joint] = places[parent] + turns[parent] @ (
-                    self._places[joint] - self._places[parent]
-                )
-                turns[joint] = turns[parent]
-            turns[joint] = own.get(joint, turns[joint] @ more.get(roles[joint], np.eye(3)))
+                turn = turns[parent]
+                places[joint] = places[parent] + turn @ (self._places[joint] - self._places[parent])
+            turns[joint] = own.get(joint, turn @ more.get(roles[joint], np.eye(3)))
         return turns, places
 
-    def _standing(self, joint: int, hinge: FloatArray, bend: FloatArray) -> FloatArray:
-        """Return the rotation that points a limb's bone down, its hinge axis along `bend`."""
-        bone = self._bones[joint][:, 1]
-        at_rest = _frame(hinge, bone)
-        return _frame(bend, -np.eye(3)[1]) @ at_rest.T
+    @cached_property
+    def _standing(self) -> dict[int, FloatArray]:
+        """The rotations that point the bones of limbs down, hinges of legs left, of arms right."""
+        left, up, _ = np.eye(3)
+        turns = {}
+        for side, (role, bend) in product(_SIDES, ((Role.THIGH, left), (Role.UPPER_ARM, -left))):
+            upper = self._limbs[role, side]
+            lower = self._next[upper]
+            hinge = self._bones[lower][:, 0]
+            for joint in (upper, lower):
+                turns[joint] = _frame(bend, -up) @ _frame(hinge, self._bones[joint][:, 1]).T
+        return turns
 
     def _leg(self, thigh: int, leg: _Leg) -> dict[int, FloatArray]:
         shin = self._next[thigh]
-        side, hinge, left = self._sign(thigh), self._bones[shin][:, 0], np.eye(3)[0]
+        side = self._sign(thigh)
         hip = _turn(-leg.hip[0], 0.0, 0.0) @ _turn(0.0, 0.0, side * leg.hip[1])
         hip = hip @ _turn(0.0, side * leg.hip[2], 0.0)
         knee = hip @ _turn(leg.knee, 0.0, 0.0)
         turns = {
-            thigh: hip @ self._standing(thigh, hinge, left),
-            shin: knee @ self._standing(shin, hinge, left),
+            thigh: hip @ self._standing[thigh],
+            shin: knee @ self._standing[shin],
         }
         if shin in self._next:
             foot = self._next[shin]
@@ -304,7 +311,7 @@ class _Body:
         self, upper: int, arm: _Arm, chest: FloatArray, places: FloatArray
     ) -> dict[int, FloatArray]:
         fore = self._next[upper]
-        side, hinge, bend = self._sign(upper), self._bones[fore][:, 0], -np.eye(3)[0]
+        side = self._sign(upper)
         mirror = np.array([side, 1.0, 1.0])
         hand = self._next.get(fore)
         if hand is None or (arm.wrist is None and arm.thigh is None):
@@ -325,11 +332,11 @@ class _Body:
             del x, z
             elbow = elbow @ _turn(0.0, np.degrees(2.0 * np.arctan2(y, w)), 0.0)
         turns = {
-            upper: shoulder @ self._standing(upper, hinge, bend),
-            fore: elbow @ self._standing(fore, hinge, bend),
+            upper: shoulder @ self._standing[upper],
+            fore: elbow @ self._standing[fore],
         }
         if hand is not None:
-            turns[hand] = wrist @ self._standing(fore, hinge, bend)
+            turns[hand] = wrist @ self._standing[fore]
         return turns
 
     def _reach(
