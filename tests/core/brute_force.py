@@ -20,6 +20,10 @@ from scipy.optimize import linprog
 FloatArray = npt.NDArray[np.float64]
 
 TRIPLES = list(itertools.combinations(range(9), 3))
+_ACROSS_EDGES = [
+    (3 * i + j, 3 * i + k, 3 * m + j)
+    for (i, m), (j, k) in itertools.product(itertools.combinations(range(3), 2), repeat=2)
+]
 
 
 def exact_depth(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
@@ -138,29 +142,31 @@ def _straddles(planes: FloatArray, points: FloatArray, faces: npt.NDArray) -> np
     normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
     # The slack keeps pairs that rounding could remove; `depths` decides on them.
     slack = 1e-12 * max(float(np.ptp(points, axis=0).max()), float(np.abs(points).max()))
-    heights = normals @ points.T - np.einsum("rc,rc->r", normals, planes[:, 0])[:, None]
-    above = (heights > -slack)[:, faces].any(axis=2)
-    below = (heights < slack)[:, faces].any(axis=2)
-    return above & below
+    heights = points @ normals.T - np.einsum("rc,rc->r", normals, planes[:, 0])
+    above, below = heights > -slack, heights < slack
+    a, b, c = faces.T
+    return ((above[a] | above[b] | above[c]) & (below[a] | below[b] | below[c])).T
 
 
 def depths(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the depths (P,) of triangles a and b (P, 3, 3), in floating point."""
     depth = np.full(len(a), np.inf)
     active = np.arange(len(a))
-    points = (a[:, :, None] - b[:, None, :]).reshape(-1, 9, 3)
-    # All planes at once for few pairs; for many, those that a plane separates are left out early.
-    for triples in np.array_split(TRIPLES, min(1 + len(a) // 100, len(TRIPLES))):
-        here = points[active]
-        i, j, k = (here[:, corners] for corners in triples.T)
+    # The pairs are the last axis, so that all sums and extremes are over leading ones.
+    points = (a[:, :, None] - b[:, None, :]).reshape(-1, 9, 3).transpose(1, 2, 0)
+    # Planes along an edge of each separate most pairs that do not meet, and come first, one by one.
+    rest = [triple for triple in TRIPLES if triple not in _ACROSS_EDGES]
+    for triples in map(np.array, [*([triple] for triple in _ACROSS_EDGES), rest]):
+        here = np.take(points, active, axis=2)
+        i, j, k = (here[corners] for corners in triples.T)
         u, v = j - i, k - i
-        n = np.cross(u, v)
-        length = np.linalg.norm(n, axis=2)
-        spans = length > 1e-12 * np.linalg.norm(u, axis=2) * np.linalg.norm(v, axis=2)
-        n /= np.where(spans, length, 1.0)[:, :, None]
-        along = n @ here.transpose(0, 2, 1)
-        support = np.minimum(along.max(axis=2), -along.min(axis=2))
-        least = np.where(spans, np.maximum(support, 0.0), np.inf).min(axis=1)
+        n = np.cross(u, v, axis=1)
+        length = np.linalg.norm(n, axis=1)
+        spans = length > 1e-12 * np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)
+        n /= np.where(spans, length, 1.0)[:, None]
+        along = np.einsum("tcp,kcp->ktp", n, here)
+        support = np.minimum(along.max(axis=0), -along.min(axis=0))
+        least = np.where(spans, np.maximum(support, 0.0), np.inf).min(axis=0)
         depth[active] = np.minimum(depth[active], least)
         active = active[depth[active] > 0.0]
     return np.where(np.isinf(depth), 0.0, depth)
