@@ -101,7 +101,8 @@ def check(
     With --with or --ground, the meshes or clips are those of a scene: pairs between bodies all
     count. A scene file saved by the editor counts as a scene.
 
-    For several clips, a table follows, deepest first. With --clips, --error-bound and the --body
+    For several meshes, the number of colliding ones follows; for several clips, a table, deepest
+    first. With --clips, --error-bound and the --body
     of a learned model, frames that its predictor is sure are free are not checked.
     """
     choose_device(device, note)
@@ -162,11 +163,15 @@ def check(
                     else checked_mesh_text(verdict)
                 )
     checked_clips = [verdict for verdict in verdicts if isinstance(verdict, CheckedClip)]
+    meshes_collide = [v.colliding for v in verdicts if not isinstance(v, CheckedClip)]
     if as_json:
         print_json([verdict.to_json() for verdict in verdicts])
-    elif len(checked_clips) > 1:
-        for line in checked_clip_table(checked_clips):
-            tell(line)
+    else:
+        if len(meshes_collide) > 1:
+            tell(f"{sum(meshes_collide)} of {len(meshes_collide)} meshes collide")
+        if len(checked_clips) > 1:
+            for line in checked_clip_table(checked_clips):
+                tell(line)
     if table is not None:
         write_clips_table(table, checked_clips)
     if failed:

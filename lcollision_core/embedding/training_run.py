@@ -61,7 +61,7 @@ class Checkpoint:
             if _RUN not in stored or stored[_RUN].metadata.get("key") != key:
                 raise LCollisionError(
                     "is the checkpoint of another training run (its poses, options or seed differ)",
-                    "delete it, or choose another checkpoint",
+                    "delete it to begin anew, or name another output",
                     where=path,
                 )
             self._sections = stored

@@ -99,6 +99,7 @@ def test_a_folder_stands_for_its_meshes(
         (str(folder / "a9.obj"), False),
         (str(folder / "a10.obj"), True),
     ]
+    assert lcollision("check", apart, folder).stdout.endswith("\n1 of 3 meshes collide\n")
 
 
 def test_several_files_come_in_order(lcollision: Lcollision, apart: Path, stabbed: Path) -> None:
