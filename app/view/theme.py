@@ -15,6 +15,7 @@ from PySide6.QtCore import QByteArray, QObject, QRectF, QSize, Qt, QTimer, Slot
 from PySide6.QtGui import (
     QAction,
     QColor,
+    QFontInfo,
     QGuiApplication,
     QIcon,
     QPainter,
@@ -115,6 +116,7 @@ def visible_colour(colour: str) -> QColor:
 
 def _style_sheet(theme: Theme) -> str:
     text = bundled_file("editor.qss").read_text(encoding="utf-8")
+    size = QFontInfo(QApplication.font()).pixelSize()
     return Template(text).substitute(
         asdict(theme),
         tick=bundled_file("icons", f"tick-{theme.name}.svg").as_posix(),
@@ -122,6 +124,8 @@ def _style_sheet(theme: Theme) -> str:
         pressed=mixed(theme.card, theme.accent, 0.22).name(),
         faded=mixed(theme.text, theme.window, 0.55).name(),
         deeper=mixed(theme.accent, theme.text, 0.18).name(),
+        headline=f"{round(size * 7 / 6)}px",
+        aside=f"{round(size * 11 / 12)}px",
     )
 
 

@@ -26,7 +26,7 @@ _MESSAGE_MILLISECONDS, _READING_MILLISECONDS = 8000, 60
 
 _FACTS_WIDTH = 300
 
-_LINES = 9
+_LINES = 12
 """Lines above the bar at which a message that it cuts off begins."""
 _RING_SIDE = 14
 

@@ -919,8 +919,8 @@ class ProposalCard(Card):
             self._document.tasks.set_rules(proposed.rules)
 
 
-_MIN_WIDTH = 250
-"""Width that shows every card beside a scroll bar."""
+_MIN_WIDTH, _BESIDE_TEXT = 250, 45
+"""Width that shows every card beside a scroll bar, and margins beside the longest button."""
 
 
 class CollisionPanel(QWidget):
@@ -948,7 +948,8 @@ class CollisionPanel(QWidget):
     def __init__(self, document: PoseDocument, actions: Mapping[str, QAction]) -> None:
         super().__init__()
         self._document = document
-        self.setMinimumWidth(_MIN_WIDTH)
+        longest = longest_name(self, ["Least distance above 13.58 mm"])
+        self.setMinimumWidth(max(_MIN_WIDTH, longest + _BESIDE_TEXT))
         self.exact = ExactCard(document)
         self.proposal = ProposalCard(document)
         self.prediction = PredictionCard(document, actions["learn_character"])

@@ -55,9 +55,9 @@ _KEYS: dict[int, float] = {
 _DECIMALS, _DECIMALS_OF_UNITS = 3, 1
 """Decimals of codes without a unit, and of degrees and per cent."""
 
-_FIELD_WIDTH, _ARROWS_WIDTH, _NARROW = 56, 22, 270
-"""Widths of a number of seven characters, of its arrows, and of a row below which the arrows are
-hidden, in device-independent pixels."""
+_FRAME_WIDTH, _ARROWS_WIDTH, _NARROW = 6, 22, 270
+"""Widths of a number's frame, of its arrows, and of a row below which the arrows are hidden, in
+device-independent pixels."""
 
 _OF_HUNDRED = 4
 """Further width of a number up to 100.0 %."""
@@ -232,7 +232,7 @@ class CodeRow(HoverRow):
         self.field.setObjectName("code")
         self.field.setSingleStep(self._shown * (high - low) / 100)
         self.field.setAlignment(Qt.AlignmentFlag.AlignRight)
-        self._field_width = _FIELD_WIDTH + (_OF_HUNDRED if is_shape else 0)
+        self._field_width = _number_width(self) + (_OF_HUNDRED if is_shape else 0)
         self.field.setFixedWidth(self._field_width + _ARROWS_WIDTH)
         source = f"motion {index + 1}"
         if not model.is_trained:
@@ -259,9 +259,9 @@ class CodeRow(HoverRow):
         self.field.refused.connect(lambda told: document.message.emit(f"{name}: {told}"))
 
     @staticmethod
-    def width_beside(name: int) -> int:
-        """Return the least width of a row in which a name of this width is not elided."""
-        return name + LEAST_TRACK + _FIELD_WIDTH + _ARROWS_WIDTH + 4 * TIGHT
+    def width_beside(name: int, number: int) -> int:
+        """Return the least width of a row in which names and numbers of these widths are whole."""
+        return name + LEAST_TRACK + number + _ARROWS_WIDTH + 4 * TIGHT
 
     def show_name(self, name: str, width: int) -> None:
         """Show a name, which takes this width before the slider grows beyond its minimum."""
@@ -357,6 +357,11 @@ class CodeRow(HoverRow):
         """Focus the field, to type a number."""
         self.field.setFocus(Qt.FocusReason.OtherFocusReason)
         self.field.selectAll()
+
+
+def _number_width(widget: QWidget) -> int:
+    """Return the width of a field for seven characters in a widget's font, without arrows."""
+    return widget.fontMetrics().horizontalAdvance("000.000") + _FRAME_WIDTH
 
 
 FloatArray = npt.NDArray[np.float64]
@@ -621,7 +626,8 @@ class SlidersPanel(QWidget):
             before = group.header.button
         self._latent_size = model.latent_size
         self._natural_width = self._width_of_names()
-        self.setMinimumWidth(min(self._natural_width, _MIN_WIDTH))
+        below = self._bottom.minimumSize().width()
+        self.setMinimumWidth(max(min(self._natural_width, _MIN_WIDTH), below))
         for group, is_open in zip(self.groups, opened, strict=False):
             group.set_open(is_open)
         self._on_filter(self.filter.text())
@@ -630,7 +636,7 @@ class SlidersPanel(QWidget):
         """Return the width at which no name is elided."""
         name = longest_name(self, map(heading, self.document.model.code_names))
         bar = self._area.verticalScrollBar().sizeHint().width()
-        return CodeRow.width_beside(name) + CLOSE + bar
+        return CodeRow.width_beside(name, _number_width(self)) + CLOSE + bar
 
     def _on_latent(self) -> None:
         latent = self.document.history.latent
@@ -668,7 +674,6 @@ class SlidersPanel(QWidget):
 
 
 _LARGEST_SEED = 999_999
-_SEED_WIDTH = 54
 
 
 class RandomiseRow(QWidget):
@@ -695,7 +700,7 @@ class RandomiseRow(QWidget):
         self._percent.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
         tip = "The same seed gives the same random pose; it increases by itself"
         self.seed = described(NumberBox(0, 0, _LARGEST_SEED), tip, "Seed")
-        self.seed.setFixedWidth(_SEED_WIDTH)
+        self.seed.setFixedWidth(self.fontMetrics().horizontalAdvance(str(_LARGEST_SEED)) + CLOSE)
         self.seed.setButtonSymbols(NumberBox.ButtonSymbols.NoButtons)
         self.button = QToolButton()
         self.button.setDefaultAction(action)

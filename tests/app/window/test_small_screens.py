@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 from PySide6.QtCore import QPoint, QRect, QSize, Qt
-from PySide6.QtGui import QScreen
+from PySide6.QtGui import QFontMetrics, QScreen
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
     QAbstractButton,
+    QApplication,
     QDialog,
     QDockWidget,
     QLabel,
@@ -213,6 +214,28 @@ def test_a_window_of_1280_by_720_is_mostly_view_and_cuts_no_readout(
     shown = row.seed.lineEdit()
     assert shown.width() >= shown.fontMetrics().horizontalAdvance("999999")
     take_picture(held, "1280x720")
+
+
+def test_numbers_and_headlines_grow_with_the_system_font(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    own = QApplication.font()
+    larger = QApplication.font()
+    larger.setPixelSize(16)
+    QApplication.setFont(larger)
+    try:
+        held = open_window(qtbot, document, settings_in(tmp_path), (1280, 720))
+        fields = [held.sliders.row_of(0).field.lineEdit(), held.randomise.seed.lineEdit()]
+        nearest, verdict = held.collision.exact.nearest, held.collision.exact.verdict
+        for field, text in zip(fields, ("-100.0°", "999999"), strict=True):
+            assert field.fontMetrics().height() > QFontMetrics(own).height()
+            assert field.width() >= field.fontMetrics().horizontalAdvance(text)
+        nearest.setText("Least distance above 13.58 mm")
+        assert nearest.width() >= nearest.sizeHint().width()
+        assert verdict.font().pixelSize() > nearest.font().pixelSize()
+        close_window(held)
+    finally:
+        QApplication.setFont(own)
 
 
 def test_a_wide_window_has_wider_panels(
