@@ -241,7 +241,7 @@ class Timeline(QObject):
         self.comparing = self._waits = False
         self._motion: Motion | None = None
         self.resolving = MotionResolve(self, tasks)
-        self._kept: tuple[Motion | None, tuple[KeptSpan, ...]] = (None, ())
+        self._kept: tuple[Motion | None, dict[KeptSpan, str]] = (None, {})
         self._edit: tuple[Motion, Motion] | None = None
         self._cache = FrameCache(self)
         self._cache.ready.connect(self._on_ready)
@@ -838,9 +838,7 @@ class Timeline(QObject):
         motion, kept = self._kept
         if motion is None or self.motion is not motion or self.comparing:
             return []
-        names = self._history.model.domain_names
-        spans = [span for span in kept if frame is None or frame in span]
-        return [with_capital(span.sentence(names)) for span in spans]
+        return [why for span, why in kept.items() if frame is None or frame in span]
 
     def _on_resolved(self, asked: Motion, found: ResolvedMotion) -> None:
         history = self._history
@@ -848,7 +846,10 @@ class Timeline(QObject):
         if state.moment is None or state.motion is not asked:
             self.message.emit(_STOPPED)
             return
-        self._kept = found.motion if found.spans else asked, found.kept
+        # Worded now: another model may be open while its motion is still read.
+        names = history.model.domain_names
+        whys = {span: with_capital(span.sentence(names)) for span in found.kept}
+        self._kept = found.motion if found.spans else asked, whys
         if found.spans:
             frame = state.moment.frame
             moment = Moment(found.motion, frame)
