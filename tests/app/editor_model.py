@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from lcollision_core.bodies import LearnedBody, user_models_folder
-from lcollision_core.predictor import PRESETS, CollisionPredictor, TrainingFacts, score_rows
-from lcollision_core.predictor.paper_network import PaperNetwork
 from tests.small_models import stored
 
 
@@ -17,6 +15,9 @@ def tube_with_predictor() -> LearnedBody:
 
     Training would load triton, which crashes in a process where Mesa draws a window.
     """
+    from lcollision_core.predictor import PRESETS, CollisionPredictor, TrainingFacts, score_rows
+    from lcollision_core.predictor.paper_network import PaperNetwork
+
     bare = stored("editor_tube")
     embedding = bare.embedding
     rows = bare.labeller().label_rows(0, range(32))

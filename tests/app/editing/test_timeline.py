@@ -17,21 +17,28 @@ from app.editing.tasks import Work
 from app.editing.timeline import Timeline
 from app.work.frames import Onion
 from app.work.motion_checks import MotionChecks, check_motion
+from app.work.preparing import open_to_show
 from lcollision_core.bodies import ExportRequest, NamedPose, open_body, write_poses
 from lcollision_core.files import read_mesh
 from lcollision_core.jobs import Job
 from lcollision_core.motion import Motion, MotionOptions, colliding_spans
 from lcollision_core.posing import make_grip
 from lcollision_core.tasks import exporting
+from lcollision_core.tasks.opening import OpenedModel
 from tests.app.windows import PATIENCE
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, through_the_trunk
 
 
+@pytest.fixture(scope="module")
+def opened_swing(swing: Path) -> OpenedModel:
+    """Return a character whose arm swings through its trunk, as the window opens it."""
+    return open_to_show(swing, Job())
+
+
 @pytest.fixture
-def timeline(qtbot: QtBot, document: PoseDocument, swing: Path) -> Timeline:
-    """Return the timeline of a document with a character whose arm swings through its trunk."""
-    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
-        document.tasks.open_model(swing)
+def timeline(qtbot: QtBot, document: PoseDocument, opened_swing: OpenedModel) -> Timeline:
+    """Return the timeline of a document with this character."""
+    document.tasks.model_opened.emit(opened_swing)
     held = document.timeline
     qtbot.waitUntil(lambda: held.motion is not None)
     return held
