@@ -44,6 +44,10 @@ class Job:
         self.note: Callable[[str], None] = note or (others[0].note if others else _nothing)
         self._event, self._others = threading.Event(), others
 
+    def __repr__(self) -> str:
+        """Return a text without an address, for signatures in documentation."""
+        return "Job()"
+
     def cancel(self) -> None:
         """Ask the work to stop at its next call of `check`."""
         self._event.set()

@@ -685,7 +685,12 @@ class Body(ABC):
         )
 
     def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
-        """Draw (n_poses, D) poses uniformly from the box of the codes' ranges."""
+        """Draw (n_poses, D) poses uniformly from the box of the codes' ranges.
+
+        Parameters
+        ----------
+        generator : such as ``np.random.default_rng(seed)``
+        """
         return self.latent_space.sample(n_poses, generator)
 
     def with_card(self, card: ModelCard, name: str | None = None) -> Self:

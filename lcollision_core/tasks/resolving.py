@@ -314,7 +314,8 @@ class ResolveMotionsRequest:
         choice = MotionChoice(substeps=options.substeps, continuous=options.continuous)
         request = cls(body, [root], target, options, choice).with_files_of_folder(job)
         if request.root is None:
-            raise LCollisionError("contains no motion", "name a folder of motions", where=root)
+            what = "contains no motion" if root.is_dir() else "is not a folder"
+            raise LCollisionError(what, "name a folder of motions", where=root)
         request.refuse_to_replace()
         return request
 

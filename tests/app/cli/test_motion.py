@@ -395,6 +395,8 @@ def test_a_folder_is_only_checked_for_a_table(
     assert [isinstance(row, ResolvedClip) and row.is_free for row in rows] == [True, True]
     with pytest.raises(LCollisionError, match=r"still\.bvh is an input"):
         ResolveMotionsRequest.of_folder(body, folder, folder)
+    with pytest.raises(LCollisionError, match="nowhere is not a folder"):
+        ResolveMotionsRequest.of_folder(body, tmp_path / "nowhere", tmp_path / "free")
     within = ResolveMotionsRequest.of_folder(body, tmp_path, folder / "free")
     assert {path.parent for path in within.files} == {folder, tmp_path / "free"}
     inside = ResolveMotionsRequest.of_folder(body, tmp_path, tmp_path / "free")
