@@ -27,7 +27,13 @@ from lcollision_core.bodies.retargeting import (
 )
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
-from lcollision_core.errors import LCollisionError, MeshFileError, listed
+from lcollision_core.errors import (
+    LCollisionError,
+    MeshFileError,
+    PoseSetError,
+    ShapeError,
+    listed,
+)
 from lcollision_core.files import (
     Character,
     FileStamp,
@@ -264,7 +270,7 @@ def read_motions(
     path : a character's file, whose clips are motions; a .bvh or .vrma file, another character's
         file, or a file of clips alone, whose skeleton a character's joints follow; an .npz motion
         of the SMPL family, if `body` is its body model in its shape: see `body_of_motion`; a pose
-        set: a point cache with its mesh beside it, an .npz file, or a folder of meshes in natural
+        set: a point cache, an .npz file, or a folder of meshes in natural
         order; or a pose file
     clip : one of the file's clips; None for all of them
     fps : frame rate; None for that of the file's keys, else 30. Only characters are resampled;
@@ -572,7 +578,11 @@ def _encoded(
     """Encode (T, V, 3) frames of meshes; their detail becomes the body's shape in each frame."""
     poses = []
     for number, frame in enumerate(frames):
-        poses.append(body.encode(frame, job))
+        try:
+            poses.append(body.encode(frame, job))
+        except (PoseSetError, ShapeError) as error:
+            what = f"frame {number} cannot be encoded"
+            raise MeshFileError.because(source, what, error) from error
         job.report(number + 1, len(frames))
     codes = np.array([pose.latent for pose in poses])
     placements: tuple[RigidTransform | None, ...] = tuple(pose.placement for pose in poses)
