@@ -102,8 +102,8 @@ def check(
     count. A scene file saved by the editor counts as a scene.
 
     For several meshes, the number of colliding ones follows; for several clips, a table, deepest
-    first. With --clips, --error-bound and the --body
-    of a learned model, frames that its predictor is sure are free are not checked.
+    first. With --clips, --error-bound and the --body of a learned model, frames that its predictor
+    is sure are free are not checked.
     """
     choose_device(device, note)
     from lcollision_core.files import require_writable

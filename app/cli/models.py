@@ -289,19 +289,22 @@ def measured_model_sentence(model: LearnedBody) -> str:
 
 def note_where_written(written: Path, destination: Path) -> None:
     """Explain that a trained model has another path than asked for, or hides a bundled model."""
-    from lcollision_core.bodies import user_models_folder
-    from lcollision_core.bundled import bundled_folder
-
     if written != destination:
         note(
             f"{destination} was replaced by another model during training and was left alone; the "
             f"trained model is {written}"
         )
-    if (
-        written.parent == user_models_folder()
-        and (bundled_folder("models") / written.name).is_file()
-    ):
-        note(f"{written.stem!r} now names this model; remove it to see the bundled one again")
+    note_if_hiding(written)
+
+
+def note_if_hiding(path: Path) -> None:
+    """Explain that a new model hides the bundled model of its name, if it does."""
+    from lcollision_core.bodies import user_models_folder
+    from lcollision_core.bundled import bundled_folder
+
+    is_bundled = (bundled_folder("models") / path.name).is_file()
+    if path.parent == user_models_folder() and is_bundled:
+        note(f"{path.stem!r} now names this model; remove it to see the bundled one again")
 
 
 def _describe_predictor(model: Body) -> dict[str, Any] | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from app.cli.console import JsonOption, cancel_on_interrupt, note, print_json, status_bar, tell
 from app.cli.contacts import note_rules
 from app.cli.evaluate import kind_lines
-from app.cli.models import note_where_written
+from app.cli.models import note_if_hiding
 from app.cli.options import takes_options
 from app.cli.shared_options import DeviceOption, ModelOutput
 from lcollision_core.devices import Device, choose_device
@@ -72,7 +72,7 @@ def new(
         raise
     work.remove()
     model = LearnedBody.load(card.model)
-    note_where_written(Path(card.model), Path(card.model))
+    note_if_hiding(Path(card.model))
     picture = Path(card.model).with_name(f"{card.name}-parts.png")
     if picture.exists():
         picture = unused_name(picture)

@@ -270,8 +270,7 @@ def read_motions(
     path : a character's file, whose clips are motions; a .bvh or .vrma file, another character's
         file, or a file of clips alone, whose skeleton a character's joints follow; an .npz motion
         of the SMPL family, if `body` is its body model in its shape: see `body_of_motion`; a pose
-        set: a point cache, an .npz file, or a folder of meshes in natural
-        order; or a pose file
+        set: a point cache, an .npz file, or a folder of meshes in natural order; or a pose file
     clip : one of the file's clips; None for all of them
     fps : frame rate; None for that of the file's keys, else 30. Only characters are resampled;
         for other files it is the rate of their frames.

@@ -409,16 +409,16 @@ class _Resolution:
         After a stop, only the frames that it makes worse stay as they were.
         """
         codes, after = other.motion.codes[: self.n], other.after[: self.n].copy()
-        moved = (codes != self.motion.codes[: self.n]).any(axis=1)
         faults = self.guard.faults(range(self.n), codes, after, self._fractions)
         if not faults:
             spans = tuple(runs((other.motion.codes != self.motion.codes).any(axis=1)))
             return replace(other, before=self.before, spans=spans, standing=self.standing)
         if not self._is_stopped:
             return None
-        moved[list(faults)] = False
-        for span in runs(moved | np.isin(np.arange(self.n), list(faults))):
-            places = [at for at in span if moved[at] and after[at]]
+        moved = (codes != self.motion.codes[: self.n]).any(axis=1)
+        is_worse = np.isin(np.arange(self.n), list(faults))
+        for span in runs(moved | is_worse):
+            places = [at for at in span if moved[at] and after[at] and not is_worse[at]]
             self._fit(span, {at - span.start: codes[at] - self.motion.codes[at] for at in places})
         left = self.wanted & ~(self.after & self._is_moved)
         self._bar(np.flatnonzero(left), Reason.STOPPED)

@@ -359,7 +359,6 @@ class SpanProgram:
     _pulls: dict[int, Pulls] = field(default_factory=dict)
     _clear: dict[tuple[int, float], FloatArray] = field(default_factory=dict)
     _best: _Evaluation | None = None
-    _n_drops: int = 0
     _n_dropped: int = 0
 
     def __post_init__(self) -> None:
@@ -394,8 +393,10 @@ class SpanProgram:
     def _settled_search(self, best: _Evaluation, enough: float) -> _Evaluation:
         """Search again while that gains much, and costs more than enough; return the best."""
         gives_way, last = True, 0.0
-        while best.n_apart and self._drop_contacts(best):
-            # Touches that contradict each other may be kept without the one that lacks most.
+        n_drops = 0
+        # Touches that contradict each other may be kept without the one that lacks most.
+        while best.n_apart and self._drop_contacts(best, drops_all=n_drops >= _DROPS):
+            n_drops += 1
             best = self._search(None)
         for _ in range(1, _SEARCHES):
             self._best, cost = best, self.cost(best.corrections)
@@ -439,10 +440,12 @@ class SpanProgram:
         freed = self._is_known & ~self._is_free_before
         return {at: self._known[at] - self._targets[at] for at in np.flatnonzero(freed).tolist()}
 
-    def _drop_contacts(self, best: _Evaluation) -> bool:
-        """Leave out the contact that lacks most where it stays apart; return whether there is one.
+    def _drop_contacts(self, best: _Evaluation, *, drops_all: bool) -> bool:
+        """Leave out, where it stays apart, the contact that lacks most, or all of them.
 
-        After some of them, all that stay apart are left out.
+        Returns
+        -------
+        whether there is one
         """
         contacts = self.frames.kept_contacts
         if contacts is None:
@@ -457,12 +460,12 @@ class SpanProgram:
                 contact = contacts.touches[at][number].contact
                 lacks[contact] += lack
                 apart.append((at, number, contact))
-        self._n_drops += 1
+        worst = max(lacks, key=lacks.__getitem__, default=None)
         dropped: dict[int, list[int]] = defaultdict(list)
         for at, number, contact in apart:
-            if self._n_drops > _DROPS or contact == max(lacks, key=lacks.__getitem__):
+            if drops_all or contact == worst:
                 dropped[at].append(number)
-        self._n_dropped += sum(map(len, dropped.values()))
+                self._n_dropped += 1
         self.frames = replace(self.frames, kept_contacts=contacts.without_touches(dropped))
         return bool(apart)
 

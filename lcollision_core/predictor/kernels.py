@@ -218,15 +218,14 @@ def _add_near(
             lanes[11 * BLOCK + i] += weight * nx
             lanes[12 * BLOCK + i] += weight * ny
             lanes[13 * BLOCK + i] += weight * nz
-            weight = outer_weight
-            lanes[14 * BLOCK + i] += weight
-            lanes[15 * BLOCK + i] -= weight * above
-            lanes[16 * BLOCK + i] += weight * dx
-            lanes[17 * BLOCK + i] += weight * dy
-            lanes[18 * BLOCK + i] += weight * dz
-            lanes[19 * BLOCK + i] += weight * nx
-            lanes[20 * BLOCK + i] += weight * ny
-            lanes[21 * BLOCK + i] += weight * nz
+            lanes[14 * BLOCK + i] += outer_weight
+            lanes[15 * BLOCK + i] -= outer_weight * above
+            lanes[16 * BLOCK + i] += outer_weight * dx
+            lanes[17 * BLOCK + i] += outer_weight * dy
+            lanes[18 * BLOCK + i] += outer_weight * dz
+            lanes[19 * BLOCK + i] += outer_weight * nx
+            lanes[20 * BLOCK + i] += outer_weight * ny
+            lanes[21 * BLOCK + i] += outer_weight * nz
 
 
 @compiled_sums
