@@ -319,6 +319,21 @@ def contacts(
     _print_rows(rows, as_json)
 
 
+@app.command("scenes")
+def scenes(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", readable=False, help="A rigged character.")
+    ],
+    as_json: JsonOption = False,
+) -> None:
+    """Resolve scenes of two copies of a character, or one and a prop; VTK checks the results."""
+    from app.benchmarks.scenes import scene_rows
+
+    with cancellable_bar("Resolving scenes") as job:
+        rows = scene_rows(file, job)
+    _print_rows(rows, as_json)
+
+
 @app.command("printing")
 def printing(
     model_names: Annotated[

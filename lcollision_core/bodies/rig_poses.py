@@ -104,27 +104,26 @@ class _Pose:
 
 
 @dataclass(frozen=True)
-class _Poses:
-    """The poses of ``resources/starter_poses.toml`` by name, in menu order."""
+class PoseTable:
+    """Poses by name, in menu order, as in ``resources/starter_poses.toml``."""
 
     body: dict[str, _Pose]
     hands: dict[str, _Hand]
 
 
-_POSES = bundled_table("starter_poses.toml", _Poses)
-BODY_POSES, HAND_POSES = _POSES.body, _POSES.hands
+POSES = bundled_table("starter_poses.toml", PoseTable)
 
 
-def starter_poses(space: RigPoseSpace) -> tuple[StarterPose, ...]:
+def starter_poses(space: RigPoseSpace, table: PoseTable = POSES) -> tuple[StarterPose, ...]:
     """Return starter poses; none for a character whose joints are unknown.
 
     Hand poses move only the fingers: see `StarterPose.moves`. Poses may collide.
     """
     body, poses = _Body(space), []
     if body.has_limbs:
-        poses = list(map(StarterPose, BODY_POSES, body.codes(BODY_POSES.values())))
+        poses = list(map(StarterPose, table.body, body.codes(table.body.values())))
     if len(body.fingers):
-        for name, hand in HAND_POSES.items():
+        for name, hand in table.hands.items():
             codes = np.zeros(len(space.low))
             body.set_hands(codes, (hand, hand))
             poses.append(StarterPose(name, codes, body.of_fingers))

@@ -13,6 +13,7 @@ from lcollision_core.bodies.motions import read_motions
 from lcollision_core.bodies.scene_file import open_any
 from tests.app.support import Lcollision
 from tests.rigged_shapes import rigged_body, write_gltf
+from tests.skeletons import PERSON, character_from
 
 
 @pytest.fixture(scope="module")
@@ -137,3 +138,18 @@ def test_no_file_of_a_body_is_replaced_unless_in_place(
     result = lcollision("resolve", *scene, "-o", f"{tmp_path}/", "--in-place")
     assert result.exit_code in (0, 1), result.output
     assert villain.read_bytes() != before
+
+
+@pytest.mark.slow
+def test_scenes_of_a_character_are_free_also_by_vtk(lcollision: Lcollision, tmp_path: Path) -> None:
+    human = write_gltf(character_from(PERSON), tmp_path / "human.glb")
+    result = lcollision("benchmark", "scenes", human, "--json")
+    assert result.exit_code == 0, result.output
+    rows = {row["scene"]: row for row in json.loads(result.stdout)}
+    assert len(rows) == 6
+    assert all(row["pairs"] > 0 for row in rows.values())
+    crossing = {name for name, row in rows.items() if row["foreign"]}
+    assert crossing >= {"hand in hand", "fist in chest", "sword in thigh"}
+    assert not any(row["pairs_after"] for row in rows.values())
+    # The grip stays in the hand.
+    assert [name for name, row in rows.items() if row["foreign_after"]] == ["sword in thigh"]

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from lcollision_core.bodies import RigBody
-from lcollision_core.bodies.rig_poses import BODY_POSES, HAND_POSES, starter_poses
+from lcollision_core.bodies.rig_poses import POSES, starter_poses
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.files import Character
 from tests.skeletons import HORSE, PERSON, character_from
@@ -64,7 +64,7 @@ def test_poses_are_the_same_whatever_the_rest_pose_is_and_joints_are_called() ->
     spread = RigPoseSpace(character_from(PERSON))
     for other in (45.0, 75.0):
         lowered = RigPoseSpace(with_arms_down(other))
-        for name in BODY_POSES:
+        for name in POSES.body:
             expected, got = places(spread, name), places(lowered, name)
             scale = lowered.body_size / spread.body_size
             for joint, place in expected.items():
@@ -97,7 +97,7 @@ def test_poses_stand_on_the_ground_within_the_limits_of_the_joints() -> None:
     body = RigBody.of(character_from(WITH_FINGERS, numbered))
     space = body.space
     names = [pose.name for pose in body.starter_poses]
-    assert names == [*BODY_POSES, *HAND_POSES]
+    assert names == [*POSES.body, *POSES.hands]
     assert len(names) == 12
     ground = (space.rest_vertices @ space.up).min()
     for pose in body.starter_poses:
