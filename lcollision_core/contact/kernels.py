@@ -189,16 +189,29 @@ def _load_vertices(pose, scale, work):
     return True
 
 
+@inlined
+def _are_one_point(vertices, a, b, c):
+    return (
+        vertices[a, 0] == vertices[b, 0]
+        and vertices[a, 0] == vertices[c, 0]
+        and vertices[a, 1] == vertices[b, 1]
+        and vertices[a, 1] == vertices[c, 1]
+        and vertices[a, 2] == vertices[b, 2]
+        and vertices[a, 2] == vertices[c, 2]
+    )
+
+
 @compiled_part
-def _refit(pose, scale, enlarged, end, tree, work):
+def _refit(pose, scale, tolerance, enlarged, end, tree, work):
     """Fill `work` for one pose and return True, or False if it is not within `MAX_DISTANCE`.
 
     Boxes of faces that are at most `enlarged` apart, in normalised length, overlap. If there is a
-    pose `end`, boxes hold the linear path of their faces to it.
+    pose `end`, boxes hold the linear path of their faces to it. With neither, faces that are one
+    point have empty boxes: they penetrate nothing, and many at one place would make many pairs.
     """
     if not _load_vertices(pose, scale, work):
         return False
-    middle, rounded = work.middle, work.rounded
+    middle, vertices, rounded = work.middle, work.vertices, work.rounded
     boxes, moves = work.boxes, len(end) > 0
     for slot in range(len(tree.slot_face)):
         leaf = slot // LEAF_SIZE
@@ -207,8 +220,11 @@ def _refit(pose, scale, enlarged, end, tree, work):
         second = tree.corners[leaf * 3 * LEAF_SIZE + LEAF_SIZE + lane]
         third = tree.corners[leaf * 3 * LEAF_SIZE + 2 * LEAF_SIZE + lane]
         base = leaf * 6 * LEAF_SIZE + lane
+        is_left_out = first < 0
+        if not is_left_out and not moves and enlarged <= tolerance:
+            is_left_out = _are_one_point(vertices, first, second, third)
         for c in range(3):
-            if first < 0:
+            if is_left_out:
                 boxes[base + c * LEAF_SIZE] = np.inf
                 boxes[base + (3 + c) * LEAF_SIZE] = -np.inf
                 continue
@@ -641,7 +657,7 @@ def search_pose(
     # With a plain 0, the search of leaves would be compiled twice.
     n_found: int = int(np.int64(0))
     if n_waiting == 0:
-        if not _refit(pose, scale, enlarged, end, tree, work):
+        if not _refit(pose, scale, tolerance, enlarged, end, tree, work):
             return -1, 0
         n_waiting = _push(stack, 0, 0, 0)
         fraction[0] = 1.0

@@ -287,6 +287,21 @@ def test_random_meshes_against_brute_force(
     check_against_brute_force(detector, vertices, faces)
 
 
+def test_faces_at_one_point_are_not_compared_with_each_other() -> None:
+    """Most of a mesh that a broken export put at one point: their pairs would take minutes."""
+    crossing = figure_eight(0.2, 0.15)
+    n, n_points = len(crossing.vertices), 30_000
+    at_one_point = np.arange(n, n + n_points).reshape(-1, 3)
+    vertices = np.concatenate([crossing.vertices, np.repeat(crossing.vertices[:1], n_points, 0)])
+    faces = np.concatenate([crossing.faces, at_one_point]).astype(np.int32)
+    detector = CollisionDetector(Topology(faces, n + n_points), vertices)
+    expected = detector_for(crossing).detect(crossing.vertices)
+    assert expected.n_pairs > 0
+    assert detector.detect(vertices).pairs.tolist() == expected.pairs.tolist()
+    summary = detector.summarise(vertices)
+    assert (summary.n_pairs, summary.n_coincident_pairs) == (expected.n_pairs, 0)
+
+
 @pytest.mark.parametrize("amplitude", [0.02, 0.1, 0.3])
 @pytest.mark.parametrize(
     "mesh", [sphere(n=20), torus(1.0, 0.3), figure_eight(0.15, 0.3)], ids=["ball", "ring", "eight"]
