@@ -136,9 +136,9 @@ def mirrored(body: Body, pairs: Iterable[FacePair]) -> list[FacePair]:
 
 
 def places_of(body: Body, pairs: Iterable[FacePair]) -> dict[tuple[str, str], int]:
-    """Count pairs of faces by the names of their body parts, meshes or components.
+    """Count pairs of faces by the names of their body parts, meshes or, without either, components.
 
-    The first of these kinds whose names differ is used, as for an arm and its bracer.
+    Meshes name two faces of one body part if they differ, as for an arm and its bracer.
     """
     file_groups, parts, components = (body.groups_by_kind[kind] for kind in GROUP_KINDS)
     names = []
@@ -150,6 +150,8 @@ def places_of(body: Body, pairs: Iterable[FacePair]) -> dict[tuple[str, str], in
     counts: Counter[tuple[str, str]] = Counter()
     for a, b in pairs:
         named_pairs = [(name[a], name[b]) for name in names if name[a] and name[b]]
-        first, second = next((pair for pair in named_pairs if pair[0] != pair[1]), named_pairs[0])
+        # Components have numbers for names, which say less than one body part does.
+        distinct = (pair for pair in named_pairs[:-1] if pair[0] != pair[1])
+        first, second = next(distinct, named_pairs[0])
         counts[min(first, second), max(first, second)] += 1
     return dict(counts.most_common())

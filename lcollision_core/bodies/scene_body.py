@@ -490,19 +490,22 @@ class SceneBody(Body):
             space.domains[at].start,
         )
 
-    @property
+    @cached_property
     def starter_poses(self) -> tuple[StarterPose, ...]:
-        """Those of the only body that is posed."""
-        only = self.only_posed
-        if only is None:
-            return ()
-        own = self._space.codes[self.standing.index(only)]
+        """Those of each body that is posed, which leave the others as they are."""
         poses = []
-        for pose in only.body.starter_poses:
-            codes, moves = np.zeros(self.latent_size), np.zeros(self.latent_size, dtype=np.bool_)
-            codes[own] = pose.codes
-            moves[own] = True if pose.moves is None else pose.moves
-            poses.append(StarterPose(pose.name, read_only(codes), moves))
+        for member, own in zip(self.standing, self._space.codes, strict=True):
+            if not member.moves or member.is_fixed:
+                continue
+            for pose in member.body.starter_poses:
+                codes, moves = (
+                    np.zeros(self.latent_size),
+                    np.zeros(self.latent_size, dtype=np.bool_),
+                )
+                codes[own] = pose.codes
+                moves[own] = True if pose.moves is None else pose.moves
+                name = self._in_body(member.name, pose.name)
+                poses.append(StarterPose(name, read_only(codes), moves))
         return tuple(poses)
 
     @cached_property

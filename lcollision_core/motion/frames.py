@@ -21,7 +21,7 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.contacts import ContactReport, KeptContacts, Pulls
 from lcollision_core.motion.motion import Motion
 from lcollision_core.posing import ExactCheck
-from lcollision_core.posing.exact import Contacts
+from lcollision_core.posing.exact import ContactRegions, Contacts, move_together
 from lcollision_core.resolve import PoseResolver, ResolveOptions
 from lcollision_core.resolve.problem import ResolveProblem
 from lcollision_core.resolve.solvers import polish
@@ -123,6 +123,26 @@ class Frames:
     def contacts(self, frame: int, codes: FloatArray) -> HalfSpacesOfPose | None:
         """Return half-spaces that separate the contacts of (D,) codes at a frame; None if free."""
         return self._separated(self.check(frame), codes)
+
+    def is_stuck(self, frame: int, share: float = 0.0) -> bool:
+        """Whether faces of the original motion collide that no movable code moves apart.
+
+        Parameters
+        ----------
+        share : fraction of the way to the next frame, of the pose that is checked
+        """
+        self.job.check()
+        start, end = self.motion.codes[[frame, min(frame + 1, len(self.motion) - 1)]]
+        codes, check = start + share * (end - start), self.motion.check(frame, self._check, share)
+        decoded = check.decode(codes)[0]
+        collisions = check.find(check.exported(decoded))
+        of_pair = ContactRegions.of(check.space, collisions).of_pair
+        faces = check.space.topology.faces[collisions.pairs]
+        movable = self.problem(frame).movable
+        return any(
+            move_together(check.space, codes, decoded, faces[pair], movable)
+            for pair in np.unique(of_pair, return_index=True)[1]
+        )
 
     def pulls(self, frame: int, codes: FloatArray) -> Pulls | None:
         """Return the pulls of a frame's kept contacts at (D,) codes; None if it has none."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from threading import Lock
 from typing import NamedTuple
 
@@ -355,7 +356,23 @@ class _Resolution:
         )
         self.codes, self.after = motion.codes[:n].copy(), before[:n].copy()
         self.is_changed, self.barred = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+        if options.frame.locked_domains or options.frame.locked_codes:
+            self._bar_stuck(pairs)
         return self
+
+    def _bar_stuck(self, pairs: npt.NDArray[np.intp]) -> None:
+        """Bar frames in which the locked codes alone place faces that collide.
+
+        Parameters
+        ----------
+        pairs : frames that are free like the next, but with a colliding pose between
+        """
+        places = [(at, 0.0) for at in np.flatnonzero(~self.before[: self.n]).tolist()]
+        places += [(at, share) for at in pairs.tolist() for share in self._fractions[at].tolist()]
+        stuck = self.frames.pool.map(lambda place: self.frames.is_stuck(*place), places)
+        for at, share in compress(places, stuck):
+            ends = [at, at + 1] if share else [at]
+            self._bar(np.array(ends) % self.n, Reason.NO_JOINT)
 
     def result(self) -> ResolvedMotion:
         """Solve all spans, until none is worse than the original."""

@@ -287,6 +287,9 @@ CLEARANCE = 2e-4
 _OPTIMAL = 1
 _TOLERANCE = 1e-9
 
+_STILL = 1e-9
+"""Slope by a code, of half a squared normalised distance, up to which the distance is fixed."""
+
 
 @dataclass(frozen=True, eq=False)
 class ContactRegions:
@@ -362,6 +365,29 @@ def contact_slopes(
     faces = space.topology.faces[found.pairs]
     add_slopes(by_vertices, regions.of_pair, faces, decoded, share, has_clearance=has_clearance)
     return deepest, space.pull_back(codes, by_vertices[deepest])
+
+
+def move_together(
+    space: PoseSpace,
+    codes: FloatArray,
+    decoded: FloatArray,
+    faces: npt.NDArray[np.integer],
+    movable: npt.NDArray[np.bool_],
+) -> bool:
+    """Whether none of the movable codes changes the distances between two faces' corners.
+
+    Parameters
+    ----------
+    codes, decoded : see `contact_slopes`
+    faces : (2, 3) vertices of the faces, which share none
+    movable : (D,)
+    """
+    ends = np.array([(a, b) for a in faces[0] for b in faces[1]])
+    apart = decoded[ends[:, 0]] - decoded[ends[:, 1]]
+    by_vertices = np.zeros((len(ends), *decoded.shape))
+    by_vertices[np.arange(len(ends))[:, None], ends] = np.stack([apart, -apart], axis=1)
+    slopes = space.pull_back(codes, by_vertices)[:, movable]
+    return bool(np.abs(slopes).max(initial=0.0) <= _STILL)
 
 
 class Contacts:

@@ -156,6 +156,9 @@ _HEIGHT_PER_ROW = 480
 
 _BLEND_STEPS = 100
 _ONLY = QItemSelectionModel.SelectionFlag.ClearAndSelect
+_HANDS = 2
+"""Most body parts that a pose of hands moves."""
+
 _BUILT_IN_TEXTS = {
     True: ("Training", "The poses that the model learned from"),
     False: ("Rest pose", "The character at rest; its clips are on the timeline"),
@@ -517,10 +520,11 @@ class LibraryPanel(QWidget):
         vertices = model.decode(pose.latent, 1).astype(np.float32)
         posed_vertices = model.without_ground(vertices)
         faces = model.faces if self._hidden is None else model.faces[~self._hidden]
-        if pose.moves is not None:
+        moved = () if pose.moves is None else np.flatnonzero(pose.moves).tolist()
+        parts = list(dict.fromkeys(model.code_effects[code].domain for code in moved))
+        if 0 < len(parts) <= _HANDS:
             # For a hand pose, show one hand, large enough to be seen.
-            part = model.code_effects[int(np.flatnonzero(pose.moves)[0])].domain
-            faces = faces[(model.attention_mask[part] > 0.5)[faces].all(axis=1)]
+            faces = faces[(model.attention_mask[parts[0]] > 0.5)[faces].all(axis=1)]
             posed_vertices = vertices[np.unique(faces)]
         view = preset_view("Three-quarter", posed_vertices, model.up_axis, model.front, 1.0)
         drawn = thumbnail_pixmap(vertices, faces, view, THUMBNAIL, device_pixel_ratio)

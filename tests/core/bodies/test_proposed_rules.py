@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import RigBody, propose_rules, typical_poses
+from lcollision_core.bodies.proposed_rules import places_of
 from lcollision_core.contact import ContactRules
 from lcollision_core.contact.kernels import TOUCHING
 from lcollision_core.errors import CancelledError
@@ -128,6 +129,19 @@ def test_what_touches_on_one_side_is_left_out_on_the_other_too() -> None:
     assert proposed is not None
     sides = np.sign(body.reference[body.faces].mean(axis=1)[np.array(proposed.new)][:, 0, 0])
     assert set(sides.tolist()) == {-1.0, 1.0}
+
+
+def test_a_place_within_one_body_part_and_mesh_has_the_name_of_the_part() -> None:
+    character = armoured()
+    arm, bracer = (
+        int(group.faces[0])
+        for group in character.groups
+        if group.name in ("LeftArm", "left bracer")
+    )
+    (pair,) = places_of(RigBody.of(character), [(arm, bracer)])
+    assert "left bracer" in pair
+    (pair,) = places_of(RigBody.of(replace(character, groups=())), [(arm, bracer)])
+    assert pair[0] == pair[1] == "Left upper arm"
 
 
 @pytest.mark.parametrize("n_frames", [0, 12])

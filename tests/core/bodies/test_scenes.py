@@ -201,6 +201,21 @@ def test_the_only_body_that_is_posed_keeps_its_names_and_its_mirror(folder: Path
     assert [p.name for p in body.starter_poses] == [p.name for p in hero.starter_poses]
 
 
+def test_starter_poses_of_several_bodies_are_named_after_them_and_move_one(two: SceneBody) -> None:
+    hero = open_body(two.members[0].body.own_file or "")
+    names = [f"{body}: {pose.name}" for body in ("hero", "villain") for pose in hero.starter_poses]
+    assert [pose.name for pose in two.starter_poses] == names != []
+    latent = 0.2 * np.random.default_rng(1).normal(size=two.latent_size)
+    for pose, expected in zip(two.starter_poses[-2:], hero.starter_poses[-2:], strict=True):
+        posed = NamedPose(pose.name, pose.codes, moves=pose.moves).applied_to(latent)
+        own = NamedPose("", expected.codes, moves=expected.moves)
+        assert np.array_equal(
+            two.codes_of_member("hero", posed), two.codes_of_member("hero", latent)
+        )
+        of_villain = two.codes_of_member("villain", latent)
+        assert np.array_equal(two.codes_of_member("villain", posed), own.applied_to(of_villain))
+
+
 def test_a_drag_moves_the_body_that_is_held_alone(two: SceneBody) -> None:
     dragger, start = two.dragger(), two.separated_poses(np.zeros(two.latent_size))[0]
     decoded = two.decode(start)
