@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, ModelFileError
-from lcollision_core.files.safe import atomic_write, require_regular
+from lcollision_core.files.safe import require_regular, write_bytes
 from lcollision_core.json_values import parse_json, quoted
 
 FORMAT_VERSION = 3
@@ -133,8 +133,7 @@ def write_model_file(path: str | os.PathLike[str], sections: Mapping[str, Sectio
     )
     encoded = save(tensors, metadata={_METADATA_KEY: document})
     try:
-        with atomic_write(path) as file:
-            file.write(encoded)
+        write_bytes(path, encoded)
     except MeshFileError as error:
         raise ModelFileError.from_error(error) from error
 

@@ -30,11 +30,10 @@ def blender_addon(
     Blender 4.2 or later: Edit > Preferences > Get Extensions > Install from Disk.
     """
     from app.blender_addon import addon_zip
-    from lcollision_core.files.safe import atomic_write
+    from lcollision_core.files.safe import write_bytes
     from lcollision_core.tasks.exporting import require_output
 
     require_output(output, ".zip")
     data = addon_zip()
-    with atomic_write(output) as file:
-        file.write(data)
+    write_bytes(output, data)
     note(f"wrote {output}; install it in Blender: Preferences > Get Extensions > Install from Disk")

@@ -32,8 +32,7 @@ from app.editing.timeline import EditedMotions
 from app.work.preparing import open_poses_to_show, open_to_show
 from app.work.threads import Failure, LongWork, Task, guarded, single_shot
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files import atomic_write
-from lcollision_core.files.safe import read_regular, require_regular
+from lcollision_core.files.safe import read_regular, require_regular, write_bytes
 from lcollision_core.jobs import Job
 from lcollision_core.json_values import from_json, parse_json, to_json
 from lcollision_core.tasks.opening import OpenedModel, ReadPoses, own_motions, read_motions
@@ -395,8 +394,7 @@ def _write(
             # The pose is still written.
             too_large = error
     write_poses(folder / _POSES, model, file_poses, working, extra)
-    with atomic_write(folder / _SESSION) as file:
-        file.write(json.dumps(session).encode())
+    write_bytes(folder / _SESSION, json.dumps(session).encode())
     if too_large is not None:
         raise too_large
     return True

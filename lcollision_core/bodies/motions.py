@@ -55,7 +55,7 @@ from lcollision_core.files.motion.smpl import (
     is_smpl_motion,
     read_smpl_motion,
 )
-from lcollision_core.files.safe import atomic_write
+from lcollision_core.files.safe import atomic_write, write_bytes
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene_files import open_rigged, read_scene
 from lcollision_core.files.table import (
@@ -669,8 +669,7 @@ def write_clips(
         data = written.changed(changes)
         as_read = FileClips.read(data, file)
     free = written.free(changes, as_read)
-    with atomic_write(path) as out:
-        out.write(data)
+    write_bytes(path, data)
     return WrittenClips(free, written.made.notes, put_back)
 
 
@@ -882,8 +881,7 @@ def _write_bvh(
         )
         carried = Retargeting.of(bvh.motion, space, file).changed(frames, before, after)
         data = bvh.with_frames(frames, *carried)
-    with atomic_write(path) as out:
-        out.write(data)
+    write_bytes(path, data)
 
 
 def ground_report(body: Body, motion: Motion) -> GroundReport | None:

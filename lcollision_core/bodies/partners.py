@@ -35,7 +35,7 @@ from lcollision_core.bundled import user_folder
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.files import Character
 from lcollision_core.files.motion.skeleton import SkeletonMotion
-from lcollision_core.files.safe import atomic_write, read_regular
+from lcollision_core.files.safe import read_regular, write_bytes
 from lcollision_core.json_values import from_json, parse_json
 from lcollision_core.meshes.joint_kinds import Role, Side
 
@@ -271,8 +271,7 @@ def remember_followed(match: JointMatch, followed: JointMap) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         document = {"format": _FORMAT, "format_version": 1, "joints": dict(followed)}
-        with atomic_write(path) as file:
-            file.write(json.dumps(document, indent=1, ensure_ascii=False).encode() + b"\n")
+        write_bytes(path, json.dumps(document, indent=1, ensure_ascii=False).encode() + b"\n")
     except (OSError, LCollisionError) as error:
         what = "the joint matching"
         raise ModelFileError.because(what, "could not be saved", error, "try again") from error

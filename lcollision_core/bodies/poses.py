@@ -31,13 +31,12 @@ from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileErro
 from lcollision_core.files import (
     FileStamp,
     Mesh,
-    atomic_write,
     file_stamp,
     locked,
     read_mesh,
     unused_name,
 )
-from lcollision_core.files.safe import read_regular
+from lcollision_core.files.safe import read_regular, write_bytes
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import convert_checked, parse_json, quoted
 from lcollision_core.meshes import RigidTransform
@@ -226,9 +225,7 @@ def write_poses(
             "write several files",
         )
     try:
-        with atomic_write(path) as file:
-            file.write(content)
-            file.write(b"\n")
+        write_bytes(path, content + b"\n")
     except MeshFileError as error:
         raise ModelFileError.from_error(error) from error
 

@@ -32,7 +32,7 @@ from lcollision_core.files import (
     without_user_choices,
 )
 from lcollision_core.files.motion.smpl import refuse_pickle
-from lcollision_core.files.safe import atomic_write, read_regular
+from lcollision_core.files.safe import read_regular, write_bytes
 from lcollision_core.files.scene_files import SceneDocument, open_scene
 from lcollision_core.files.table import FILES, MODEL_SUFFIX, SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.json_values import from_json, parse_document
@@ -350,8 +350,7 @@ def _change(model: Body, change: Callable[[RememberedChoices], RememberedChoices
                 return
             entries = {name: entry for name, entry in asdict(known).items() if entry is not None}
             document = {"format": _FORMAT, "format_version": _VERSION, **entries}
-            with atomic_write(path) as file:
-                file.write(json.dumps(document, indent=1).encode() + b"\n")
+            write_bytes(path, json.dumps(document, indent=1).encode() + b"\n")
     except (OSError, MeshFileError) as error:
         raise ModelFileError.because(
             f"the settings of {model.name}", "could not be saved", error, "try again"

@@ -52,7 +52,7 @@ from lcollision_core.files.motion.skeleton import (
 )
 from lcollision_core.files.motion.smpl import is_smpl_motion, read_smpl_motion, skeleton_of_smpl
 from lcollision_core.files.motion.vrma import read_vrma, vrma_bytes
-from lcollision_core.files.safe import atomic_write
+from lcollision_core.files.safe import write_bytes
 from lcollision_core.files.scene.scene import nearest_above
 from lcollision_core.files.scene.transforms import from_rotation_vectors, rotation_vectors
 from lcollision_core.files.scene_files import as_file_error, read_skeleton_scene
@@ -789,8 +789,7 @@ def write_skeleton(
         data = bvh_of(body.space, transforms, 1.0 / fps)
     else:
         data = vrma_of(body.character, body.space, transforms, np.arange(len(latents)) / fps)
-    with atomic_write(path) as out:
-        out.write(data)
+    write_bytes(path, data)
     if is_bvh:
         # Any rig can read back its own BVH file; retargeting might not match it.
         latents_in_file = transforms_from_bvh(body.space, read_bvh(path))

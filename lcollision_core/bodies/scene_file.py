@@ -21,7 +21,7 @@ from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember, ScenePart
 from lcollision_core.errors import LCollisionError, ModelFileError, listed
 from lcollision_core.files import Character, Rig, read_character, read_mesh
-from lcollision_core.files.safe import atomic_write, read_regular
+from lcollision_core.files.safe import read_regular, write_bytes
 from lcollision_core.files.scene.transforms import from_rotation_vectors
 from lcollision_core.files.table import READABLE_SUFFIXES, SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.json_values import from_json, parse_document, parse_json
@@ -124,8 +124,7 @@ def write_scene_file(path: str | os.PathLike[str], scene: SceneFile) -> None:
         "bodies": bodies,
         **({} if scene.ground is None else {"ground": scene.ground}),
     }
-    with atomic_write(path) as file:
-        file.write(json.dumps(document, indent=1, ensure_ascii=False).encode() + b"\n")
+    write_bytes(path, json.dumps(document, indent=1, ensure_ascii=False).encode() + b"\n")
 
 
 def open_scene_file(path: str | os.PathLike[str]) -> SceneBody:

@@ -31,7 +31,7 @@ from lcollision_core.files.character_reading import character_of
 from lcollision_core.files.gltf.read import read_shown
 from lcollision_core.files.gltf.schema import PARTS, VERTEX_DATA, GltfDocument, stored_parts
 from lcollision_core.files.mesh.polygons import MAX_FILE_BYTES
-from lcollision_core.files.safe import atomic_write, make_unique, read_regular
+from lcollision_core.files.safe import make_unique, read_regular, write_bytes
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene.scene import (
     KEYS_ARE_FRAMES,
@@ -317,8 +317,7 @@ def write_character(
         data = source.signed(rules)
     if clips:
         notes.append(left_out_note("clips left out, as they would hide the pose", clips))
-    with atomic_write(path) as out:
-        out.write(data)
+    write_bytes(path, data)
     return PosedFile(data, stored, (*source.patch.notes, *notes))
 
 
@@ -390,8 +389,7 @@ def write_character_clips(
     notes = source.patch.notes
     if left_out:
         notes = (*notes, left_out_note("clips left out", left_out))
-    with atomic_write(path) as out:
-        out.write(data)
+    write_bytes(path, data)
     return data, notes
 
 

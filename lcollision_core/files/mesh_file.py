@@ -21,7 +21,7 @@ from lcollision_core.files.mesh.polygons import (
     triangulate,
     with_order_of,
 )
-from lcollision_core.files.safe import atomic_write
+from lcollision_core.files.safe import write_bytes
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene.scene import Scene
 from lcollision_core.files.scene_files import as_file_error, document_of, opened, scene_of
@@ -356,8 +356,7 @@ def write_mesh(
         data = encode_obj(points, topology.faces, detail)
     else:
         data = function_of(FILES[suffix].writer)(points, topology.faces)
-    with atomic_write(path) as file:
-        file.write(data)
+    write_bytes(path, data)
 
 
 def turn_to_y(up: FloatArray) -> FloatArray:

@@ -234,6 +234,17 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             unfinished.unlink(missing_ok=True)
 
 
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write a whole file, as `atomic_write` does.
+
+    Raises
+    ------
+    MeshFileError : as in `atomic_write`.
+    """
+    with atomic_write(path) as file:
+        file.write(data)
+
+
 def write_table(
     path: str | os.PathLike[str], columns: Iterable[str], rows: Iterable[Mapping[str, object]]
 ) -> None:
@@ -247,8 +258,7 @@ def write_table(
     table = csv.DictWriter(text, list(columns), extrasaction="ignore", lineterminator="\n")
     table.writeheader()
     table.writerows(rows)
-    with atomic_write(path) as file:
-        file.write(text.getvalue().encode())
+    write_bytes(path, text.getvalue().encode())
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lcollision_core.bodies import Body, NamedPose
 from lcollision_core.contact import solids
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files.safe import atomic_write
+from lcollision_core.files.safe import write_bytes
 from lcollision_core.files.table import FILES, PRINT_SUFFIXES, function_of
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import named_group
@@ -93,8 +93,7 @@ def print_pose(
         *(solid.translate(-low), options.height, dtype), lambda point: places.where(point + low)
     )
     job.check()
-    with atomic_write(path) as file:
-        file.write(function_of(form.writer)(written, triangles))
+    write_bytes(path, function_of(form.writer)(written, triangles))
     job.report(_STEPS, _STEPS)
     kinds = [layer.kind for layer in layers]
     x, y, z = np.ptp(written, axis=0).tolist()

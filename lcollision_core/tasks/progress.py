@@ -16,7 +16,7 @@ from lcollision_core.bodies import Body, NamedPose, read_poses, write_poses
 from lcollision_core.embedding.training_run import run_key
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.files import locked
-from lcollision_core.files.safe import atomic_write, shortened
+from lcollision_core.files.safe import shortened, write_bytes
 from lcollision_core.jobs import Job
 from lcollision_core.meshes.face_groups import ignored_faces_digest
 from lcollision_core.options import ResolveOptions
@@ -218,8 +218,7 @@ def run_of_rows(
         return {name: item for name, item in record["done"].items() if is_current(name, item)}
 
     def write(path: Path, record: dict[str, Any], done: dict[str, dict[str, Any]]) -> None:
-        with atomic_write(path) as file:
-            file.write(json.dumps({**record, "done": done}).encode())
+        write_bytes(path, json.dumps({**record, "done": done}).encode())
 
     with locked(path, wait=0.0):
         run = Run(path, key, total, "file", read, write, job, pause=-1.0)

@@ -17,8 +17,8 @@ from typing import Any
 from lcollision_core.bodies import LearnedBody, list_models, user_models_folder
 from lcollision_core.bodies.learned_body import WORK_SUFFIX, work_path
 from lcollision_core.errors import FileLockedError, LCollisionError, MeshFileError, ModelFileError
-from lcollision_core.files import atomic_write, file_stamp, locked
-from lcollision_core.files.safe import read_regular
+from lcollision_core.files import file_stamp, locked
+from lcollision_core.files.safe import read_regular, write_bytes
 from lcollision_core.files.table import MODEL_SUFFIX
 from lcollision_core.json_values import from_json, parse_json, to_json
 from lcollision_core.learning_state import LearningStatus, RunState, Stage
@@ -220,8 +220,7 @@ class WorkFolder:
 
     def _write(self, name: str, values: Mapping[str, Any]) -> None:
         content = json.dumps({"version": _VERSION, **values}, indent=1)
-        with atomic_write(self.path / name) as file:
-            file.write(content.encode())
+        write_bytes(self.path / name, content.encode())
 
 
 def stamped(request: LearningRequest) -> LearningRequest:

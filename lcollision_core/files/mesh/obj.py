@@ -29,7 +29,7 @@ from lcollision_core.files.mesh.text import (
     points,
     vertex_numbers,
 )
-from lcollision_core.files.safe import atomic_write, read_regular
+from lcollision_core.files.safe import read_regular, write_bytes
 from lcollision_core.meshes.normals import moved_normals
 
 _SHORTEST_LINE = len(b"f 1 2 3\n")
@@ -264,8 +264,7 @@ def rewrite_obj(
         data = rewritten(read_regular(source, MAX_FILE_BYTES), vertices)
     except (MeshFileError, OSError) as error:
         raise MeshFileError.unreadable(source, error, "check the file") from error
-    with atomic_write(path) as file:
-        file.write(data)
+    write_bytes(path, data)
 
 
 def rewritten(data: bytes, vertices: npt.NDArray[Any]) -> bytes:
