@@ -256,6 +256,29 @@ class Body(ABC):
 
     notes: tuple[str, ...] = ()
 
+    character: Character | None = None
+    """The character of the file whose joints pose the body; None for a body without joints."""
+    joints: RigPoseSpace | None = None
+    """`space` if it is that of a rig's joints; None for a body without joints."""
+    embedding: Embedding | None = None
+    """The latent space of a learned body; None for others."""
+
+    is_trained = False
+    """Whether the pose space was learned from the poses that came with the body."""
+    has_predictor = False
+    """Whether a predictor was trained."""
+    can_resolve = True
+    """Whether colliding poses can be resolved."""
+
+    shape_names: tuple[str, ...] = ()
+    """S names of the last codes, the weights of morph targets; most bodies have none."""
+    fixed_domains: frozenset[int] = frozenset()
+    """The body parts that must not move, such as those of a fixed body of a scene."""
+    ground: tuple[float, npt.NDArray[np.bool_]] | None = None
+    """Normalised height of the ground and a (V,) mask of the other vertices; None without."""
+    own_card: ModelCard | None = None
+    """The card of a body whose file does not keep the user's choices, before any of them."""
+
     def __init__(
         self,
         name: str,
@@ -296,18 +319,8 @@ class Body(ABC):
         )
 
     @property
-    def fixed_domains(self) -> frozenset[int]:
-        """The body parts that must not move, such as those of a fixed body of a scene."""
-        return frozenset()
-
-    @property
     def starter_poses(self) -> tuple[StarterPose, ...]:
         """Poses to begin with; none unless the rig's joints are known."""
-        return ()
-
-    @property
-    def shape_names(self) -> tuple[str, ...]:
-        """S names of the last codes, the weights of morph targets; most bodies have none."""
         return ()
 
     @property
@@ -321,21 +334,6 @@ class Body(ABC):
         """The effect of raising each of the D codes."""
 
     @property
-    def character(self) -> Character | None:
-        """The character of the file whose joints pose the body; None for a body without joints."""
-        return None
-
-    @property
-    def joints(self) -> RigPoseSpace | None:
-        """`space` if it is that of a rig's joints; None for a body without joints."""
-        return None
-
-    @property
-    def embedding(self) -> Embedding | None:
-        """The latent space of a learned body; None for others."""
-        return None
-
-    @property
     def own_file(self) -> Path | None:
         """The character's file; None for a body without joints."""
         return None if self.character is None else self.character.source
@@ -344,11 +342,6 @@ class Body(ABC):
     def own_clips(self) -> tuple[str, ...]:
         """The names of the character's clips."""
         return () if self.character is None else tuple(self.character.clips)
-
-    @property
-    def ground(self) -> tuple[float, npt.NDArray[np.bool_]] | None:
-        """Normalised height of the ground and a (V,) mask of the other vertices; None without."""
-        return None
 
     def without_ground(self, vertices: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return (..., V, 3) vertices without those of the ground, for fitting views."""
@@ -362,16 +355,6 @@ class Body(ABC):
     def appearance(self) -> Appearance | None:
         """How the body looks in its source file; None if unknown."""
         return None
-
-    @property
-    def is_trained(self) -> bool:
-        """Whether the pose space was learned from the poses that came with the body."""
-        return False
-
-    @property
-    def has_predictor(self) -> bool:
-        """Whether a predictor was trained; does not load it."""
-        return False
 
     @property
     def predictor(self) -> CollisionPredictor | None:
@@ -408,11 +391,6 @@ class Body(ABC):
 
     no_predictor: tuple[str, str]
     """Why there is no predictor, with a field for the body's name, and advice."""
-
-    @property
-    def can_resolve(self) -> bool:
-        """Whether colliding poses can be resolved; loads nothing."""
-        return True
 
     @property
     @abstractmethod
@@ -942,8 +920,8 @@ class Body(ABC):
 
     @property
     def own_rules(self) -> ContactRules:
-        """The rules in the body's file, or the initial ones of a character."""
-        return self.rules
+        """The rules in the body's file, or the initial ones of a character or a scene."""
+        return self.rules if self.own_card is None else self.own_card.rules
 
     @property
     def rules_are_chosen(self) -> bool:

@@ -513,13 +513,10 @@ class SourceFile:
             return [("", np.arange(self._body.n_vertices))]
         scene = self._character.file.scene
         faces_of: dict[int, list[npt.NDArray[np.integer]]] = {}
-        start = 0
-        for part in scene.parts:
-            end = start + len(part.points)
-            faces_of.setdefault(part.node, []).append(self._character.joined[start:end])
-            start = end
+        for part, rows in zip(scene.parts, scene.rows, strict=True):
+            faces_of.setdefault(part.node, []).append(self._character.joined[rows])
         names = {part.node: scene.node_names[part.node] or part.mesh for part in scene.parts}
-        return [(names[node], np.concatenate(rows)) for node, rows in faces_of.items()]
+        return [(names[node], np.concatenate(faces)) for node, faces in faces_of.items()]
 
 
 def shapes_in_file(

@@ -248,6 +248,8 @@ class LearnedBody(Body):
         "the model {name!r} has no predictor",
         "run `lcollision label` and then `lcollision train predictor`",
     )
+    is_trained = True
+    embedding: Embedding
 
     def __init__(
         self,
@@ -271,13 +273,9 @@ class LearnedBody(Body):
             embedding.attention_mask,
             embedding.training_latent.astype(np.float64),
         )
-        self._embedding = embedding
+        self.embedding = embedding
         self._other_sections = dict(other_sections or {})
-
-    @property
-    def embedding(self) -> Embedding:
-        """The latent space."""
-        return self._embedding
+        self.has_predictor = self.can_resolve = _PREDICTOR in self._other_sections
 
     @cached_property
     def appearance(self) -> Appearance | None:
@@ -457,21 +455,6 @@ class LearnedBody(Body):
     def _with_section(self, name: str, section: Section) -> LearnedBody:
         sections = {**self._other_sections, name: section}
         return LearnedBody(self.name, self.embedding, self.card, sections)
-
-    @property
-    def is_trained(self) -> bool:
-        """True: the latent space was learned."""
-        return True
-
-    @property
-    def has_predictor(self) -> bool:
-        """Whether a predictor was trained; unlike `predictor`, loads nothing."""
-        return _PREDICTOR in self._other_sections
-
-    @property
-    def can_resolve(self) -> bool:
-        """Whether there is a predictor, which Resolve needs."""
-        return self.has_predictor
 
     @cached_property
     def predictor(self) -> CollisionPredictor | None:

@@ -49,6 +49,7 @@ class MeshBody(Body):
     """
 
     no_predictor = "the mesh has no predictor", "name a model"
+    can_resolve = False
 
     def __init__(
         self,
@@ -144,11 +145,6 @@ class MeshBody(Body):
     def body_size(self) -> float:
         """The body size in the file's unit."""
         return self.detector.body_size
-
-    @property
-    def can_resolve(self) -> bool:
-        """False: nothing moves the mesh."""
-        return False
 
     @property
     def free_latent(self) -> FloatArray:

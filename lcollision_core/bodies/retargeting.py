@@ -59,6 +59,7 @@ from lcollision_core.files.scene_files import as_file_error, read_skeleton_scene
 from lcollision_core.files.table import BVH_SUFFIX, SKELETON_SUFFIXES, VRMA_SUFFIX
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.trees import lineage
 from lcollision_core.motion import NOMINAL_RATE, Motion
 
 _SHORT, _SHORT_BONE = 1e-9, 0.02
@@ -574,8 +575,9 @@ def _recognised(space: RigPoseSpace) -> dict[str, int]:
     legs = [joint for name, joint in joints.items() if name.endswith("UpperLeg")]
     arms = [joint for name, joint in joints.items() if name.endswith("UpperArm")]
     if legs and arms and "head" in joints:
-        shared = set.intersection(*(set(_above(rig, joint)) for joint in (*legs, *arms)))
-        hips, trunk = max(shared, default=-1), _above(rig, joints["head"])
+        above = (set(lineage(rig.parents, joint)[1:]) for joint in (*legs, *arms))
+        hips = max(set.intersection(*above), default=-1)
+        trunk = lineage(rig.parents, joints["head"])[:0:-1]
         spine = [joint for joint in trunk if roles[joint] is Role.SPINE and joint > hips]
         if len(spine) > len(_SPINE):
             spine = [spine[0], spine[len(spine) // 2], spine[-1]]
@@ -583,14 +585,6 @@ def _recognised(space: RigPoseSpace) -> dict[str, int]:
         if hips >= 0:
             joints["hips"] = hips
     return joints
-
-
-def _above(rig: Rig, joint: int) -> list[int]:
-    """Return a joint's ancestors, from the root."""
-    way = []
-    while (joint := int(rig.parents[joint])) >= 0:
-        way.append(joint)
-    return way[::-1]
 
 
 def _parents(rig: Rig, joints: Sequence[int]) -> list[int]:

@@ -465,12 +465,17 @@ class RigBody(Body):
 
     Attributes
     ----------
+    character : as given
+    joints : the pose space of the rig
     own_card : the card from its file, before any choices of the user
     notes : sentences about changes made on reading, and other differences from the file
     """
 
     no_predictor = "the character {name!r} has no predictor", "train a model of its poses"
     has_unit = True
+    character: Character
+    joints: RigPoseSpace
+    own_card: ModelCard
 
     def __init__(
         self, character: Character, space: RigPoseSpace, card: ModelCard, poses: FloatArray
@@ -483,7 +488,8 @@ class RigBody(Body):
             space.attention_mask,
             poses,
         )
-        self._character, self._space = character, space
+        self.character, self.joints = character, space
+        self.shape_names = () if space.rig.shapes is None else space.rig.shapes.names
         self.own_card, self.notes = card, (*character.notes, *space.anatomy.notes)
 
     @classmethod
@@ -571,30 +577,15 @@ class RigBody(Body):
             return body
         return body._with_detector(body.card, body.detector.with_touching(touching))
 
-    @property
-    def own_rules(self) -> ContactRules:
-        """The initial rules of the character, which its file does not store."""
-        return self.own_card.rules
-
     @cached_property
     def appearance(self) -> Appearance | None:
         """Appearance of the character; large textures take long to read."""
         return self.character.look()
 
     @property
-    def character(self) -> Character:
-        """The rigged character."""
-        return self._character
-
-    @property
-    def joints(self) -> RigPoseSpace:
-        """The pose space of the rig."""
-        return self._space
-
-    @property
     def space(self) -> RigPoseSpace:
         """The pose space of the rig, which dragging and Resolve use."""
-        return self._space
+        return self.joints
 
     @cached_property
     def fingerprint(self) -> str:
@@ -620,7 +611,7 @@ class RigBody(Body):
         return digest_of(json.dumps(names), arrays)[:16]
 
     def _vertex_labels(self) -> npt.NDArray[np.str_]:
-        return joint_parts(self.character, self._space.anatomy)
+        return joint_parts(self.character, self.joints.anatomy)
 
     @cached_property
     def free_latent(self) -> FloatArray:
@@ -733,12 +724,6 @@ class RigBody(Body):
             for name in unique_names(names[start:end])
         )
         return *joints, *self.shape_names
-
-    @property
-    def shape_names(self) -> tuple[str, ...]:
-        """S names of its morph targets, as in its file."""
-        shapes = self.space.rig.shapes
-        return () if shapes is None else shapes.names
 
     @cached_property
     def code_words(self) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.limbs import LEAST_LIMB, Limbs
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, length_graph
+from lcollision_core.meshes.trees import ancestry
 from lcollision_core.posing.pose_space import DisplacementMetrics, PosesOnGpu
 
 ROOT_CODES = 6
@@ -382,10 +383,7 @@ class RigPoseSpace:
     @cached_property
     def _carried(self) -> npt.NDArray[np.bool_]:
         """(B, B) mask: row b holds bone b and its ancestors."""
-        carried = np.eye(len(self._bones), dtype=np.bool_)
-        for bone, parent in enumerate(self._parents[1:].tolist(), 1):
-            carried[bone] |= carried[parent]
-        return carried
+        return ancestry(self._parents)
 
     @property
     def metric(self) -> FloatArray:

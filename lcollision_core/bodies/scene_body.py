@@ -35,9 +35,9 @@ from lcollision_core.files.scene.appearance import Appearance, join_appearances
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import FaceGroup, RigidTransform, Topology
 from lcollision_core.meshes.face_groups import MAX_GROUPS
-from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.topology import FloatArray, consecutive
 from lcollision_core.model_file import digest_of
-from lcollision_core.posing import ExactCheck, PoseSpace
+from lcollision_core.posing import ExactCheck
 from lcollision_core.resolve import BodyAlone, PoseResolver
 
 _GAP = 0.01
@@ -162,16 +162,20 @@ class SceneBody(Body):
         self.members, self.file = tuple(members), file
         first = members[0]
         self._size = first.body.body_size * first.place.scale
-        self.vertices_of: dict[str, slice] = {}
-        self.faces_of: dict[str, slice] = {}
         self.standing = [member for member in members if member.holder is None]
+        in_order = [own for member in self.standing for own in (member, *self._held_by(member))]
+        names = [member.name for member in in_order]
+        vertices = consecutive(member.body.n_vertices for member in in_order)
+        faces = consecutive(len(member.body.faces) for member in in_order)
+        self.vertices_of = dict(zip(names, vertices, strict=True))
+        self.faces_of = dict(zip(names, faces, strict=True))
         self._space = SceneSpace([self._placed(member) for member in self.standing])
-        names, colours = self._domains()
+        domain_names, colours = self._domains()
         rules, groups = self._joined_rules()
         card = ModelCard(
             height=self._size,
             up_axis=first.body.up_axis,
-            domain_names=names,
+            domain_names=domain_names,
             domain_colours=colours,
             pose_names=("rest",),
             source=", ".join(member.body.card.source for member in members)[:1000],
@@ -190,6 +194,15 @@ class SceneBody(Body):
             np.zeros((1, len(space.low))),
         )
         self.own_card = card
+        self.shape_names = tuple(
+            self._in_body(member.name, name)
+            for member in self.standing
+            if member.moves
+            for name in member.body.shape_names
+        )
+        fixed = (self.domains_of_member(member.name) for member in members if member.is_fixed)
+        self.fixed_domains = frozenset(chain.from_iterable(fixed))
+        self.ground = self._find_ground()
         several = "it has several bodies", "mirror the pose of each by itself"
         only = self.only_posed
         self.no_sides = several if only is None else only.body.no_sides
@@ -203,9 +216,8 @@ class SceneBody(Body):
         other.file = file
         return other
 
-    @cached_property
-    def ground(self) -> tuple[float, npt.NDArray[np.bool_]] | None:
-        """Normalised height of the ground and a (V,) mask of the other vertices; None without."""
+    def _find_ground(self) -> tuple[float, npt.NDArray[np.bool_]] | None:
+        """Return `ground`."""
         for member in self.members:
             if member.is_ground:
                 rows, stands = self.vertices_of[member.name], np.ones(self.n_vertices, np.bool_)
@@ -245,37 +257,23 @@ class SceneBody(Body):
         return found
 
     def _placed(self, member: SceneMember) -> PlacedSpace:
-        """Return the space of a member and its held bodies, and record their slices."""
+        """Return the space of a member and its held bodies."""
         body, place = member.body, member.place
         in_scene = RigidTransform(
             place.rotation,
             place.translation / self._size,
             place.scale * body.body_size / self._size,
         )
-        start = max((rows_of.stop for rows_of in self.vertices_of.values()), default=0)
-        first_face = max((faces_of.stop for faces_of in self.faces_of.values()), default=0)
-        held_members = self._held_by(member)
-        faces, n_vertices = [], 0
-        for moved_member in (member, *held_members):
-            faces.append(moved_member.body.faces + n_vertices)
-            n_faces = sum(map(len, faces))
-            last = first_face + n_faces
-            self.faces_of[moved_member.name] = slice(last - len(faces[-1]), last)
-            stop = start + n_vertices + moved_member.body.n_vertices
-            self.vertices_of[moved_member.name] = slice(start + n_vertices, stop)
-            n_vertices += moved_member.body.n_vertices
-        space: PoseSpace = (
-            body.space
-            if member.moves
-            else StillSpace(body.topology, body.reference / body.body_size)
-        )
-        topology, n_vertices = body.topology, body.n_vertices
-        for number, moved_member in enumerate(held_members, 1):
-            n_vertices += moved_member.body.n_vertices
-            topology = Topology(np.concatenate(faces[: number + 1]), n_vertices)
-            points = place.inverse().apply(moved_member.reference)
+        if not member.moves:
+            still = StillSpace(body.topology, body.reference / body.body_size)
+            return PlacedSpace(still, in_scene)
+        space, topology = body.space, body.topology
+        for held in self._held_by(member):
+            faces = np.concatenate([topology.faces, held.body.faces + topology.n_vertices])
+            topology = Topology(faces, topology.n_vertices + held.body.n_vertices)
+            points = place.inverse().apply(held.reference)
             assert isinstance(space, RigPoseSpace)
-            space = space.holding(moved_member.name, topology, points, moved_member.joint)
+            space = space.holding(held.name, topology, points, held.joint)
         return PlacedSpace(space, in_scene)
 
     def _domains(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -405,12 +403,6 @@ class SceneBody(Body):
                 return own
         return range(0)
 
-    @property
-    def fixed_domains(self) -> frozenset[int]:
-        """The body parts of fixed bodies."""
-        fixed = (self.domains_of_member(member.name) for member in self.members if member.is_fixed)
-        return frozenset(chain.from_iterable(fixed))
-
     def joined_codes(self, codes: Sequence[FloatArray | None]) -> FloatArray:
         """Join (D_k,) codes of the members into (D,); None and static bodies stay at rest."""
         joined = np.zeros(self.latent_size)
@@ -444,11 +436,6 @@ class SceneBody(Body):
         ]
         arrays: dict[str, npt.NDArray[Any]] = {}
         return digest_of("scene " + "; ".join(members), arrays)[:16]
-
-    @property
-    def own_rules(self) -> ContactRules:
-        """The rules of the bodies."""
-        return self.own_card.rules
 
     @cached_property
     def front(self) -> FloatArray:
@@ -553,16 +540,6 @@ class SceneBody(Body):
         """D names of the codes; those of whole bodies are prefixed with the body's name."""
         names = self._named_codes(lambda body: body.code_names)
         return (*names[: sum(self._space.group_sizes)], *self.shape_names)
-
-    @property
-    def shape_names(self) -> tuple[str, ...]:
-        """The bodies' shape names, prefixed with the body's name."""
-        return tuple(
-            self._in_body(member.name, name)
-            for member in self.standing
-            if member.moves
-            for name in member.body.shape_names
-        )
 
     @cached_property
     def code_words(self) -> tuple[str, ...]:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Sequence, Set
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +14,7 @@ import scipy
 from lcollision_core.bodies.rig_space import ROOT_CODES
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.limbs import Limbs
-from lcollision_core.meshes.topology import FloatArray, length_graph
+from lcollision_core.meshes.topology import FloatArray, consecutive, length_graph
 from lcollision_core.posing import PoseSpace
 from lcollision_core.posing.pose_space import DisplacementMetrics
 
@@ -154,17 +153,18 @@ class SceneSpace:
     def __init__(self, members: Sequence[PlacedSpace]) -> None:
         self.members = tuple(members)
         spaces = [member.space for member in members]
-        sizes = [space.topology.n_vertices for space in spaces]
-        starts = np.cumsum([0, *sizes])
-        self.vertices = [slice(a, b) for a, b in pairwise(starts)]
-        faces = [space.topology.faces + at for space, at in zip(spaces, starts[:-1], strict=True)]
-        self.topology = Topology(np.concatenate(faces), int(starts[-1]))
+        self.vertices = consecutive(space.topology.n_vertices for space in spaces)
+        faces = [
+            space.topology.faces + rows.start
+            for space, rows in zip(spaces, self.vertices, strict=True)
+        ]
+        self.topology = Topology(np.concatenate(faces), self.vertices[-1].stop)
         self.rest_vertices: FloatArray = np.concatenate(
             [member.placed(member.space.rest_vertices) for member in members]
         )
-        ends = np.cumsum([0, *(space.n_domains for space in spaces)]).tolist()
-        self.domains = [range(a, b) for a, b in pairwise(ends)]
-        self.n_domains: int = ends[-1]
+        domains = consecutive(space.n_domains for space in spaces)
+        self.domains = [range(own.start, own.stop) for own in domains]
+        self.n_domains: int = self.domains[-1].stop
         self.vertex_domain: _Indices = np.concatenate(
             [
                 space.vertex_domain + own.start

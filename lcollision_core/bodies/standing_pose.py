@@ -21,6 +21,7 @@ from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.motion.skeleton import SkeletonMotion, least_turns
 from lcollision_core.meshes.joint_kinds import Role, Side, part_names
 from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.trees import lineage
 
 _MOST_SAMPLES, _MOST_FIGURES = 64, 8
 """Number of frames sampled, and of those in which the joint tree is recognised."""
@@ -297,12 +298,7 @@ def _chest(motion: SkeletonMotion, marks: _Landmarks) -> int:
 
 def common_ancestor(motion: SkeletonMotion, joints: Sequence[int]) -> int:
     """Return the last joint that is an ancestor of, or equal to, all given joints."""
-    ways = []
-    for joint in joints:
-        way = [joint]
-        while motion.parents[way[-1]] >= 0:
-            way.append(int(motion.parents[way[-1]]))
-        ways.append(set(way))
+    ways = [set(lineage(motion.parents, joint)) for joint in joints]
     return max(set.intersection(*ways), default=0) if ways else 0
 
 

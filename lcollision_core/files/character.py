@@ -84,12 +84,8 @@ class CharacterFile:
     @cached_property
     def parts(self) -> list[tuple[Part, Primitive, slice]]:
         """Each part with its primitive in the file and its rows of the file's vertices."""
-        parts, start = [], 0
-        for part in self.scene.parts:
-            if part.primitive is not None:
-                parts.append((part, part.primitive, slice(start, start + len(part.points))))
-            start += len(part.points)
-        return parts
+        pairs = zip(self.scene.parts, self.scene.rows, strict=True)
+        return [(part, part.primitive, rows) for part, rows in pairs if part.primitive is not None]
 
     @cached_property
     def stored_normals(self) -> list[FloatArray | None]:

@@ -40,6 +40,7 @@ from lcollision_core.files.table import GLTF_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.extents import body_size, box_corners, guess_up
 from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.trees import ancestry
 
 _NEAR, _NEARLY = 0.05, 1.5
 """Separate pieces, as of a robot, adjoin vertices within the first distance, normalised, and within
@@ -75,10 +76,7 @@ def with_ends_on_limbs(
     notes : a sentence that names the ends, if there are any
     """
     parents, led_by = rig.parents.tolist(), rig.heaviest
-    carries = np.eye(len(parents), dtype=np.bool_)
-    for joint in range(len(parents) - 1, -1, -1):
-        if parents[joint] >= 0:
-            carries[parents[joint]] |= carries[joint]
+    carries = ancestry(rig.parents).T
     n_led = np.bincount(led_by, minlength=len(parents))
     ends: dict[int, int] = {}
     for joint in _hanging_on_nothing(rig, n_led, carries):

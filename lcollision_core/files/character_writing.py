@@ -181,9 +181,8 @@ def read_own_file(document: SceneDocument) -> OwnFile | None:
         mesh = join_parts(posed)
         places = mesh.posed(posed.rest)[0][mesh.joined]
         rows: dict[int, list[FloatArray]] = {}
-        starts = np.cumsum([0, *(len(part.points) for part in posed.parts)]).tolist()
-        for part, start, end in zip(posed.parts, starts[:-1], starts[1:], strict=True):
-            rows.setdefault(part.node, []).append(places[start:end])
+        for part, own in zip(posed.parts, posed.rows, strict=True):
+            rows.setdefault(part.node, []).append(places[own])
         in_order = [rows[node].pop(0) for node in record.shown_by if rows.get(node)]
         points = np.concatenate(in_order) if in_order else np.empty((0, 3))
         if points.shape != (len(character.joined), 3):

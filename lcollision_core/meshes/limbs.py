@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.trees import lineage
 
 _SHARE = 0.15
 """A segment that leads a smaller share of the grip is not held."""
@@ -64,10 +65,7 @@ class Limbs:
 
     def path(self, segment: int) -> list[int]:
         """Return a segment and its ancestors, up to the root."""
-        path = [segment]
-        while self.parents[path[-1]] >= 0:
-            path.append(int(self.parents[path[-1]]))
-        return path
+        return lineage(self.parents, segment)
 
     def limb(self, segment: int, least: float = 0.0) -> list[int]:
         """Return the limb of a segment from there upwards.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cached_property
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -35,6 +37,11 @@ def array_of(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
             where=name,
             got=type(values).__name__,
         ) from error
+
+
+def consecutive(sizes: Iterable[int]) -> list[slice]:
+    """Return slices of the given sizes, each from the end of the one before."""
+    return [slice(start, end) for start, end in pairwise(accumulate(sizes, initial=0))]
 
 
 def edge_graph(edges: IntArray, n_vertices: int, weights: FloatArray) -> scipy.sparse.csr_matrix:

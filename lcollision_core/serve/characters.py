@@ -18,6 +18,7 @@ from lcollision_core.files.character_reading import character_of
 from lcollision_core.files.safe import read_regular
 from lcollision_core.files.scene.scene import Part, Scene, ScenePoses
 from lcollision_core.meshes import FaceGroup
+from lcollision_core.meshes.trees import ancestry
 from lcollision_core.serve.messages import Array, MeshPart, Open, OpenMesh
 
 FloatArray = npt.NDArray[np.float64]
@@ -125,23 +126,13 @@ class OpenedCharacter:
         chords = np.linalg.norm(turned[..., :3, :3] - np.eye(3), axis=(2, 3)) / np.sqrt(2.0)
         shifts = np.linalg.norm(turned[..., :3, 3], axis=2) / self.body.body_size
         moves = (chords * self._reaches + shifts).max(axis=0)
-        carried, left_out = self._carried, np.zeros(len(moves))
+        carried, left_out = ancestry(self.body.space.rig.parents), np.zeros(len(moves))
         small: list[int] = []
         for joint in np.argsort(moves).tolist():
             further = left_out + carried[:, joint] * moves[joint]
             if further.max() <= least:
                 left_out, small = further, [*small, joint]
         return np.where(self.body.space.codes_of_joints(np.array(small, np.int64)), before, after)
-
-    @cached_property
-    def _carried(self) -> npt.NDArray[np.bool_]:
-        """(J, J) whether the first joint of the rig is the second one or its descendant."""
-        parents = self.body.space.rig.parents
-        carried = np.eye(len(parents), dtype=np.bool_)
-        for joint, above in enumerate(parents.tolist()):
-            if above >= 0:
-                carried[joint] |= carried[above]
-        return carried
 
     @cached_property
     def _reaches(self) -> FloatArray:

@@ -133,10 +133,8 @@ class _Maker:
         description["nodes"] = self._nodes()
         roots = np.flatnonzero(self._parents < 0).tolist()
         description |= {"scene": 0, "scenes": [{"nodes": roots}], "meshes": []}
-        start, vertices = 0, []
-        for number, part in enumerate(self._scene.parts):
-            vertices.append(start + self._add_part(number, part))
-            start += len(part.points)
+        pairs = zip(self._scene.parts, self._scene.rows, strict=True)
+        vertices = [rows.start + self._add_part(n, part) for n, (part, rows) in enumerate(pairs)]
         delays = {name: max(0.0, -float(times[0])) for name, times in self._times.items()}
         animations = [
             self._animation(number, clip.name, clip.moved, delays[clip.name])

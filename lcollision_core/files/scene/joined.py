@@ -17,7 +17,7 @@ from lcollision_core.files.scene.transforms import blend_dual_quaternions
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.contact_rules import MAX_GROUP_NAME_LENGTH
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
-from lcollision_core.meshes.topology import FloatArray, Topology, degenerate_faces
+from lcollision_core.meshes.topology import FloatArray, Topology, consecutive, degenerate_faces
 
 IntArray = npt.NDArray[np.int64]
 
@@ -110,11 +110,10 @@ class JoinedMesh:
         """
         n, n_vertices = len(poses.transforms), self.topology.n_vertices
         result = np.empty((n, n_vertices, 3))
-        blend = self._blend
         for pose in range(n):
             job.check()
             with np.errstate(over="ignore", invalid="ignore"):
-                blended = self._blended(blend, poses.transforms[pose])
+                blended = self._blended(poses.transforms[pose])
                 points = self.morphed(tuple(weights[pose] for weights in poses.weights))
                 result[pose] = np.einsum("vij,vj->vi", blended[:, :, :3], points)
                 result[pose] += blended[:, :, 3]
@@ -131,11 +130,16 @@ class JoinedMesh:
         entries = (self.weights.reshape(-1), (rows, self.bone_of.reshape(-1)))
         return scipy.sparse.csr_matrix(entries, (n_vertices, len(self.bones)))
 
-    def _blended(self, blend: scipy.sparse.csr_matrix, transforms: FloatArray) -> FloatArray:
+    def _blended(self, transforms: FloatArray) -> FloatArray:
         """Return the (V, 3, 4) affine maps of the vertices, for (nodes, 4, 4) transforms."""
         turns = transforms[self.bones] @ self.bind
-        blended = (blend @ turns[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
-        return self._with_dual_quaternions(blended, turns)
+        blended: FloatArray = (self._blend @ turns[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
+        rows = np.flatnonzero(self.dual)
+        if len(rows):
+            other = blend_dual_quaternions(turns, self.bone_of[rows], self.weights[rows])[:, :3]
+            share = self.dual[rows, None, None]
+            blended[rows] = (1.0 - share) * blended[rows] + share * other
+        return blended
 
     def linear_parts(self, transforms: FloatArray) -> FloatArray:
         """Return the (V, I, 3, 3) linear maps of each vertex by each of its bones alone.
@@ -147,18 +151,8 @@ class JoinedMesh:
         turns: FloatArray = (transforms[self.bones] @ self.bind)[self.bone_of, :3, :3]
         rows = np.flatnonzero(self.dual)
         if len(rows):
-            turns[rows] = self._blended(self._blend, transforms)[rows, None, :, :3]
+            turns[rows] = self._blended(transforms)[rows, None, :, :3]
         return turns
-
-    def _with_dual_quaternions(self, blended: FloatArray, turns: FloatArray) -> FloatArray:
-        """Mix dual quaternion blends into (V, 3, 4) linear blends, by their shares."""
-        rows = np.flatnonzero(self.dual)
-        if not len(rows):
-            return blended
-        other = blend_dual_quaternions(turns, self.bone_of[rows], self.weights[rows])[:, :3]
-        share = self.dual[rows, None, None]
-        blended[rows] = (1.0 - share) * blended[rows] + share * other
-        return blended
 
 
 def sample_clip(
@@ -308,31 +302,28 @@ def _common_bones(parts: tuple[Part, ...]) -> tuple[IntArray, FloatArray, IntArr
     weights : (W, I) float64 array
     """
     number_of_bone: dict[tuple[int, bytes], int] = {}
-    bones: list[int] = []
-    binds: list[FloatArray] = []
     width = max(part.bone_of.shape[1] for part in parts)
     n = sum(len(part.points) for part in parts)
     bone_of, weights = np.zeros((n, width), dtype=np.int64), np.zeros((n, width))
-    start = 0
-    for part in parts:
-        numbers = np.empty(len(part.bones), dtype=np.int64)
-        for i, (bone, bind) in enumerate(zip(part.bones.tolist(), part.bind + 0.0, strict=True)):
-            key = bone, bind.tobytes()
-            if key not in number_of_bone:
-                number_of_bone[key] = len(bones)
-                bones.append(bone)
-                binds.append(bind)
-            numbers[i] = number_of_bone[key]
-        rows = slice(start, start + len(part.points))
-        start += len(part.points)
+    for part, rows in zip(parts, consecutive(len(part.points) for part in parts), strict=True):
+        pairs = zip(part.bones.tolist(), part.bind + 0.0, strict=True)
+        numbers = np.array(
+            [
+                number_of_bone.setdefault((bone, bind.tobytes()), len(number_of_bone))
+                for bone, bind in pairs
+            ]
+        )
         columns = part.bone_of.shape[1]
         weights[rows, :columns] = part.weights
         bone_of[rows, :columns] = np.where(part.weights > 0.0, numbers[part.bone_of], 0)
     # Those without weight come last, with number 0.
-    order = np.argsort(np.where(weights > 0.0, bone_of, len(bones)), axis=1, kind="stable")
+    n_bones = len(number_of_bone)
+    order = np.argsort(np.where(weights > 0.0, bone_of, n_bones), axis=1, kind="stable")
     bone_of = np.take_along_axis(bone_of, order, axis=1)
     weights = np.take_along_axis(weights, order, axis=1)
-    return np.array(bones, dtype=np.int64), np.stack(binds), bone_of, weights
+    bones, binds = zip(*number_of_bone, strict=True)
+    bind = np.frombuffer(b"".join(binds)).reshape(-1, 4, 4).copy()
+    return np.array(bones, dtype=np.int64), bind, bone_of, weights
 
 
 def _morph_numbers(parts: tuple[Part, ...]) -> IntArray:
@@ -371,12 +362,9 @@ def _first_of_equal(rows: npt.NDArray[np.integer]) -> tuple[IntArray, IntArray]:
 def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tuple[FaceGroup, ...]:
     """Return the faces of each mesh and material, merged by name."""
     number = np.cumsum(~is_left_out) - 1
-    start = 0
     faces_of: dict[str, list[IntArray]] = {}
     meshes: set[str] = set()
-    for part in parts:
-        rows = np.arange(start, start + len(part.faces))
-        start += len(part.faces)
+    for part, rows in zip(parts, consecutive(len(part.faces) for part in parts), strict=True):
         is_kept = ~is_left_out[rows]
         named = [(part.mesh, is_kept)]
         for index, name in enumerate(part.materials):
@@ -384,7 +372,7 @@ def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tupl
         for name, group_name in named:
             printable = "".join(filter(str.isprintable, name))[:MAX_GROUP_NAME_LENGTH]
             if printable.strip():
-                faces_of.setdefault(printable, []).append(number[rows[group_name]])
+                faces_of.setdefault(printable, []).append(number[rows][group_name])
                 meshes |= {printable} if group_name is is_kept else set()
     group_faces = list(faces_of.items())[:MAX_GROUPS]
     return tuple(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,8 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError, listed
 from lcollision_core.files.scene.appearance import Appearance
 from lcollision_core.files.scene.transforms import are_regular, is_regular
-from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.topology import FloatArray, consecutive
+from lcollision_core.meshes.trees import lineage
 
 MAX_FRAME_NUMBERS = 1 << 28
 """Most coordinates, and most numbers of node transforms, in the frames of a clip."""
@@ -258,6 +259,11 @@ class Scene:
     bound: Mapping[int, FloatArray] = field(default_factory=dict)
     document: Any = None
 
+    @property
+    def rows(self) -> list[slice]:
+        """Rows of each part's points among those of all parts."""
+        return consecutive(len(part.points) for part in self.parts)
+
 
 def by_node(parts: Sequence[Part], values: Sequence[FloatArray]) -> dict[int, FloatArray]:
     """Return the (N, M) morph target values of each node, the longest of its parts."""
@@ -275,13 +281,9 @@ def character_parts(scene: Scene) -> list[int]:
     than by nodes above the skeleton.
     """
     joints = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
-
-    def with_carriers(node: int) -> list[int]:
-        return [node, *_ancestors(scene, node)]
-
+    with_carriers = partial(lineage, scene.parents)
     moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
     movers = joints | moved.difference(*map(with_carriers, joints))
-
     return [
         number
         for number, part in enumerate(scene.parts)
@@ -384,23 +386,13 @@ def shown_scene(scene: Scene) -> Scene:
 
     The faces of a part of zero scale have no area, so its rest pose could not be checked.
     """
-    carriers = _carriers(scene)
+    movers = {bone for part in scene.parts for bone in part.bones.tolist()}
+    carriers = {carrier for bone in movers for carrier in lineage(scene.parents, bone)}
     for node in parents_first(scene.parents):
         if node in carriers and node not in scene.revealed:
             scene = _revealed(scene, node)
     scene = with_parts(scene, character_parts(scene), "as no joint carries it")
     return with_parts(scene, _seen_parts(scene), "as its scale is zero")
-
-
-def _carriers(scene: Scene) -> set[int]:
-    """Return the nodes that move parts, and their ancestors."""
-    carriers: set[int] = set()
-    for part in scene.parts:
-        for bone in part.bones.tolist():
-            while bone >= 0 and bone not in carriers:
-                carriers.add(bone)
-                bone = int(scene.parents[bone])
-    return carriers
 
 
 def _revealed(scene: Scene, node: int) -> Scene:
@@ -439,7 +431,7 @@ def _revealed(scene: Scene, node: int) -> Scene:
     names = [part.mesh for part in parts if not set(part.bones.tolist()).isdisjoint(below)]
     note = f"hidden at rest by its scale, shown as in the clip {clip_name!r}"
     joints = {bone for part in parts if part.is_skinned for bone in part.bones.tolist()}
-    if not joints.isdisjoint(_ancestors(scene, node)):
+    if not joints.isdisjoint(lineage(scene.parents, node)[1:]):
         # A node that a clip only shows and hides is carried by its joint.
         clips = tuple(replace(clip, moved=clip.moved - {node}) for clip in scene.clips)
         scene = replace(scene, clips=clips)
@@ -450,13 +442,6 @@ def _revealed(scene: Scene, node: int) -> Scene:
         notes=(*scene.notes, left_out_note(note, names)),
         revealed=(*scene.revealed, *below),
     )
-
-
-def _ancestors(scene: Scene, node: int) -> list[int]:
-    ancestors = []
-    while (node := int(scene.parents[node])) >= 0:
-        ancestors.append(node)
-    return ancestors
 
 
 def _above(transforms: FloatArray, parent: int) -> FloatArray:
@@ -495,7 +480,7 @@ def _seen_parts(scene: Scene) -> list[int]:
     is_visible = sizes >= _INVISIBLE * sizes.max()
     if any(part.is_skinned for part in scene.parts):
         for number, part in enumerate(scene.parts):
-            carriers = [part.node, *_ancestors(scene, part.node)]
+            carriers = lineage(scene.parents, part.node)
             is_visible[number] &= part.is_skinned or any(
                 is_regular(rest[node]) for node in carriers
             )
