@@ -108,7 +108,7 @@ class DocumentState:
 
     def drawn(self, model: Body) -> npt.NDArray[np.float32]:
         """Return the (V, 3) vertices as drawn, in the data's unit: see `ExactCheck`."""
-        check = model.exact_check(self.pose.placement, self.space and self.space())
+        check = model.exact_check(space=self.space and self.space())
         return check.drawn(check.decode(self.pose.latent)[0])
 
     def same_as(self, other: DocumentState) -> bool:

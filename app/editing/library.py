@@ -44,7 +44,6 @@ class Library(QObject):
     def __init__(self, history: PoseHistory, saving: LongWork, folder: Path | None = None) -> None:
         super().__init__(history)
         self._history, self._saving, self._folder = history, saving, folder
-        self._writing = 0
 
     def opened(self, model: Body) -> PoseLibrary:
         """Read the library of a model."""
@@ -227,7 +226,7 @@ class Library(QObject):
 
     @property
     def _is_writing(self) -> bool:
-        return bool(self._saving.label_of(self._writing))
+        return bool(self._saving.labels(self))
 
     def _write(self, store: PoseLibrary) -> None:
         if store.is_written:
@@ -250,7 +249,7 @@ class Library(QObject):
             # The open library may be another model's, or another one of the same file.
             self.refresh()
 
-        self._writing = self._saving.start("Saving the pose library", work, done)
+        self._saving.start("Saving the pose library", work, done, kind=self)
 
     def _tell_changed(self) -> None:
         self.changed.emit()

@@ -12,9 +12,6 @@ from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.history import PoseHistory, read_only
 from app.work.frames import (
-    CodeTarget,
-    GripTarget,
-    MeasuredFrame,
     MotionStart,
     PoseFrame,
     PoseMailbox,
@@ -57,7 +54,7 @@ class ActiveMotion:
     """
 
     start: MotionStart
-    target: CodeTarget | GripTarget | None = None
+    target: FloatArray | None = None
     pin: tuple[int, Grip] | None = None
     has_ended: bool = False
     least_miss: float = field(default=np.inf)
@@ -133,8 +130,8 @@ class PoseMotion(QObject):
     exact : the exact check of the drawn pose (see `shows_another`); None until it is known
     nearest : the nearest pair of the drawn pose; None until measured, or if none is in range
     is_measured : whether `nearest` was measured
-    unmeasured : the frame to measure once it rests, is checked and `set_ready` was called
-    unchecked : the frame to check completely once it rests; None if it has been
+    resting : the frame to check completely once it rests, and then, once `set_ready` was called, to
+        measure; None if all is known of it
     solid : drags and edits of the codes keep the pose free of self-collision
     standing : body parts that stand on the ground stay there in drags
     whole_body : the whole body follows drags, not only the held limb
@@ -168,8 +165,7 @@ class PoseMotion(QObject):
         self.exact: SelfCollisions | None = None
         self.nearest: NearestPair | None = None
         self.is_measured = self.shows_another = False
-        self.unchecked: PoseFrame | None = None
-        self.unmeasured: PoseFrame | None = None
+        self.resting: PoseFrame | None = None
         self.solid, self.standing, self.whole_body = True, True, False
         self.drag_strength, self.clearance = 1.0, 0.0
         self.locked_domains: frozenset[int] = frozenset()
@@ -218,7 +214,7 @@ class PoseMotion(QObject):
     def close(self, deadline: float) -> bool:
         """End the thread; see `LongWork.close`."""
         self._rested.stop()
-        self._moving = self.unchecked = self.unmeasured = None
+        self._moving = self.resting = None
         return self._mailbox.close(deadline)
 
     # Locks.
@@ -263,7 +259,7 @@ class PoseMotion(QObject):
     def expects_frame(self) -> bool:
         """Whether a frame is pending that will probably arrive at once."""
         pending = self._mailbox.pending
-        return self._is_quick and any(not request.is_of_rest for request in pending)
+        return self._is_quick and any(request.resting is None for request in pending)
 
     @property
     def expects_verdict(self) -> bool:
@@ -376,7 +372,7 @@ class PoseMotion(QObject):
             angle in radians since the start
         """
         if self.dragging:
-            self._move(GripTarget(read_only(np.array(target, dtype=np.float64).reshape(-1))))
+            self._move(np.array(target, dtype=np.float64).reshape(-1))
 
     def end_drag(self) -> None:
         """Let go: the pose settles on the newest target, unless another action begins."""
@@ -483,8 +479,10 @@ class PoseMotion(QObject):
     @property
     def _wanted(self) -> FloatArray:
         """(D,) codes that an edit of some of them starts from."""
-        target = self._moving.target if self._moving is not None and self.moving else None
-        return target.aim if isinstance(target, CodeTarget) else self._history.latent
+        moving = self._moving
+        if moving is None or moving.target is None or moving.start.grip is not None:
+            return self._history.latent
+        return moving.target if self.moving else self._history.latent
 
     def _set_codes(self, label: str, codes: Any, value: float, run: int | None = None) -> None:
         latent = self._wanted.copy()
@@ -517,7 +515,7 @@ class PoseMotion(QObject):
             if is_own:
                 history.open_gesture(label, run)
             self._begin(None).has_ended = is_own
-        self._move(CodeTarget(read_only(latent)))
+        self._move(latent)
 
     def _tell_if_locked(self) -> None:
         if self.all_locked:
@@ -549,47 +547,35 @@ class PoseMotion(QObject):
         self._moving = ActiveMotion(start)
         return self._moving
 
-    def _move(self, target: CodeTarget | GripTarget) -> None:
-        """Continue towards another target."""
+    def _move(self, target: FloatArray) -> None:
+        """Continue towards another target, which is made read-only."""
         moving, gesture = self._moving, self._history.gesture
         assert moving is not None
         assert gesture is not None
         gesture.has_asked = True
-        moving.target, moving.least_miss, moving.n_idle = target, np.inf, 0
+        moving.target, moving.least_miss, moving.n_idle = read_only(target), np.inf, 0
         self._mailbox.put(PoseRequest(self._history.model, target, moving.start, self._predicts))
 
     def follow(self) -> None:
         """Request the frame, and later the exact check, of the present pose."""
-        self._moving = self.unchecked = self.unmeasured = None
+        self._moving = self.resting = None
         self.shows_another = False
-        model, pose = self._history.model, self._history.pose
-        self._mailbox.put(
-            PoseRequest(
-                *(model, CodeTarget(pose.latent), None, self._predicts),
-                placement=pose.placement,
-                space=self._history.state.space,
-            )
-        )
+        history, predicts = self._history, self._predicts
+        space = history.state.space
+        self._mailbox.put(PoseRequest(history.model, history.latent, None, predicts, space))
 
     @Slot()
     def _check(self) -> None:
-        if self._mailbox.pending:
+        resting = self.resting
+        if self._mailbox.pending or resting is None:
             return
-        model = self._history.model
-        if self.unchecked is not None:
-            self._mailbox.put(PoseRequest(model, None, unchecked=self.unchecked))
-        elif self.unmeasured is not None and self._is_ready:
-            self._mailbox.put(PoseRequest(model, None, unmeasured=self.unmeasured))
+        if self._is_ready or not resting.is_checked:
+            self._mailbox.put(PoseRequest(self._history.model, resting=resting))
 
     def _look_on(self) -> None:
         """Start the timer for the outstanding check or measurement, if there is one."""
-        if self._is_incomplete and not self._mailbox.pending:
+        if self.resting is not None and not self._mailbox.pending:
             self._rested.start()
-
-    @property
-    def _is_incomplete(self) -> bool:
-        """Whether the pose still has to be checked or measured once it rests."""
-        return self.unchecked is not None or self.unmeasured is not None
 
     def _stop(self) -> None:
         """End the motion at its newest frame; drop its later results."""
@@ -605,7 +591,7 @@ class PoseMotion(QObject):
         lacks = frame is None or (self._predicts and frame.prediction is None)
         if not self.shows_another and (lacks or not is_of_pose):
             self.follow()
-        elif self._is_incomplete:
+        elif self.resting is not None:
             self._rested.start()
 
     @Slot()
@@ -635,12 +621,7 @@ class PoseMotion(QObject):
 
     @Slot(object, object)
     def _on_answered(self, request: PoseRequest, answer: Response) -> None:
-        if isinstance(answer.value, MeasuredFrame):
-            self._note_measure(answer.value)
-            self._mailbox.send()
-            self._look_on()
-            return
-        frame: PoseFrame | None = answer.value
+        frame: PoseFrame | None = answer.value if request.resting is None else None
         moving = self._moving
         if moving is None or request.start is not moving.start:
             moving = None
@@ -651,7 +632,7 @@ class PoseMotion(QObject):
             self._mailbox.put(request)
         # The next request is sent before the response is drawn: the worker need not wait.
         self._mailbox.send()
-        if not request.is_of_rest and frame is not None:
+        if frame is not None:
             self._is_quick = frame.seconds < _QUICK_SECONDS
         # Skip a late frame: drawing it takes longer than computing the newest one.
         self._has_skipped = is_late and self._is_quick and not self._has_skipped
@@ -659,13 +640,13 @@ class PoseMotion(QObject):
             return
         if answer.failure is not None:
             self._report(request, answer.failure)
-        elif frame is not None:
+        else:
             self._reported.pop(request.kind, None)
-            if request.unchecked is not None:
-                self._note_check(request.unchecked, frame)
-            elif moving is not None:
+            if request.resting is not None:
+                self._note(request.resting, answer.value)
+            elif moving is not None and frame is not None:
                 self._adopt(moving, frame)
-            elif request.start is None:
+            elif request.start is None and frame is not None:
                 self._show(frame)
         self._look_on()
         if moving is not None and moving.has_ended and not self.moving:
@@ -675,22 +656,20 @@ class PoseMotion(QObject):
         if failure.headline != self._reported.get(request.kind):
             self._reported[request.kind] = failure.headline
             self.failed.emit(failure)
-        if request.unchecked is self.unchecked:
-            self.unchecked = None
-        if request.unmeasured is self.unmeasured:
-            self.unmeasured = None
+        if request.resting is self.resting:
+            self.resting = None
         self.exact_changed.emit()
 
-    def _note_check(self, unchecked: PoseFrame, checked: PoseFrame) -> None:
-        if unchecked is self.unchecked:
-            self.unchecked, self.exact = None, checked.found
-            self.exact_changed.emit()
-
-    def _note_measure(self, measured: MeasuredFrame) -> None:
-        if measured.frame is self.unmeasured:
-            self.unmeasured = None
-            self.nearest, self.is_measured = measured.nearest, True
+    def _note(self, resting: PoseFrame, answer: Any) -> None:
+        """Note the check of a frame, which is measured next, or its measurement."""
+        if resting is not self.resting:
+            return
+        if resting.is_checked:
+            self.resting, self.nearest, self.is_measured = None, answer, True
             self.nearest_changed.emit()
+        else:
+            self.resting, self.exact = answer, answer.found
+            self.exact_changed.emit()
 
     def _show(self, frame: PoseFrame) -> None:
         """Show a requested frame; while a slider moves, it is of an earlier pose."""
@@ -699,8 +678,7 @@ class PoseMotion(QObject):
         self.frame = frame
         is_of_pose = frame.latent is self._history.latent
         if is_of_pose:
-            self.unchecked = None if frame.is_checked else frame
-            self.unmeasured = frame
+            self.resting = frame
         is_found = is_of_pose and frame.found is not None
         if is_found:
             self._set_exact(frame.found)
@@ -728,8 +706,7 @@ class PoseMotion(QObject):
 
     def show_instead(self, frame: PoseFrame) -> None:
         """Draw and check a frame that is not the pose's, until the pose changes or `show_own`."""
-        self.frame = self.unmeasured = frame
-        self.unchecked = None if frame.is_checked else frame
+        self.frame = self.resting = frame
         self.shows_another = True
         self._set_exact(frame.found)
         self.frame_changed.emit()
@@ -751,8 +728,7 @@ class PoseMotion(QObject):
         self._take(frame, state)
 
     def _take(self, frame: PoseFrame, state: DocumentState) -> None:
-        self.unchecked = None if frame.is_checked else frame
-        self.frame = self.unmeasured = frame
+        self.frame = self.resting = frame
         self.shows_another = False
         self._set_exact(frame.found)
         self._adopted = frame.latent

@@ -74,7 +74,7 @@ class MotionResolve(QObject):
         self.progress: ResolveProgress | None = None
         self._solved: npt.NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
         self._stop = Job()
-        tasks.motion_progressed.connect(self._on_progress)
+        tasks.progressed.connect(self._on_progress)
         tasks.busy_changed.connect(self._on_busy)
 
     @property
@@ -142,10 +142,10 @@ class MotionResolve(QObject):
         ground = ground_text(None if found.ground is None else asdict(found.ground))
         return joined((text, now, *kept_sentences, ground))
 
-    @Slot(int, int)
-    def _on_progress(self, done: int, total: int) -> None:
+    @Slot(object, int, int)
+    def _on_progress(self, work: object, done: int, total: int) -> None:
         progress = self.progress
-        if progress is not None:
+        if work is Work.RESOLVE_MOTION and progress is not None:
             began = progress.began if progress.total else time.monotonic()
             self.progress = ResolveProgress(began, done, total)
             self.changed.emit()

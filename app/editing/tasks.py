@@ -48,8 +48,12 @@ _SAVE_SECONDS = 30.0
 """How long a closing window waits for its files, as on a slow network disk."""
 
 
+_EXPORT = "export"
+"""Kind of the jobs that write files: each has a snapshot, and outlives its model."""
+
+
 class Work(Enum):
-    """The slots of long work: in each, a new job replaces the previous one."""
+    """The kinds of long work for the present model: a new job replaces the previous one."""
 
     RESOLVE = auto()
     EASE = auto()
@@ -89,10 +93,9 @@ class Tasks(QObject):
     message : str, one sentence for the status bar
     failed : Failure
     busy_changed : str, the label of the long work, or "" if there is none
-    progressed : int and int, steps of the long work done, and their total
-    solve_started, solve_progressed(int, int), solve_finished(object) : around a Resolve; the last
-        carries its ResolveResult, or None if it was cancelled or failed
-    motion_progressed : int and int, frames that a Resolve of a motion has done, and their total
+    progressed : the kind of the long work, its steps done, and their total
+    solve_started, solve_finished(object) : around a Resolve; the latter carries its ResolveResult,
+        or None if it was cancelled or failed
     opened : Path, the file of poses or of a model that is now open
     imported : Path, the mesh that has become the pose
     of_other_model : OtherModelError, if a poses file needs another known model
@@ -107,11 +110,9 @@ class Tasks(QObject):
     message = Signal(str)
     failed = Signal(object)
     busy_changed = Signal(str)
-    progressed = Signal(int, int)
+    progressed = Signal(object, int, int)
     solve_started = Signal()
-    solve_progressed = Signal(int, int)
     solve_finished = Signal(object)
-    motion_progressed = Signal(int, int)
     opened = Signal(object)
     imported = Signal(object)
     of_other_model = Signal(object)
@@ -126,8 +127,6 @@ class Tasks(QObject):
         super().__init__(history)
         self._history, self._motion = history, motion
         self._library, self._saving = library, saving
-        self._numbers: dict[Work, int] = {}
-        self._exports: list[int] = []
         self._solve_began = 0.0
         self._prepared = self._is_closed = False
         self.proposed_rules: ProposedRules | None = None
@@ -136,12 +135,12 @@ class Tasks(QObject):
         self.may_leave_pose: Callable[[], bool] = lambda: True
         self._long = LongWork(self)
         self._long.busy_changed.connect(self.busy_changed)
-        self._long.progressed.connect(self._on_progressed)
+        self._long.progressed.connect(self.progressed)
         self._long.failed.connect(self.failed)
         self._history.latent_changed.connect(self._on_latent_changed)
         self._motion.locks_changed.connect(self.cancel_resolve)
 
-    # The slots.
+    # The kinds of work.
 
     def start(
         self,
@@ -151,19 +150,13 @@ class Tasks(QObject):
         done: Callable[[Any], None],
         failed: Callable[[Failure], None] | None = None,
     ) -> None:
-        """Start work in the long worker, replacing the job in its slot; see `LongWork`."""
-        self.cancel(work)
-        self._numbers[work] = self._long.start(label, job, done, failed)
-        # Listeners ask by slot, whose number is set only now.
-        self.busy_changed.emit(self.busy)
+        """Start work in the long worker, replacing the job of its kind; see `LongWork`."""
+        self._long.cancel(work)
+        self._long.start(label, job, done, failed, work)
 
-    def cancel(self, *works: Work) -> None:
-        """Stop the jobs in these slots."""
-        for work in works:
-            self._long.cancel(self._numbers.get(work, 0))
-
-    def _label(self, work: Work) -> str:
-        return self._long.label_of(self._numbers.get(work, 0))
+    def cancel(self, work: Work) -> None:
+        """Stop the job of a kind."""
+        self._long.cancel(work)
 
     @property
     def busy(self) -> str:
@@ -173,32 +166,32 @@ class Tasks(QObject):
     @property
     def solving(self) -> bool:
         """Whether a Resolve of the pose runs."""
-        return bool(self._label(Work.RESOLVE))
+        return bool(self._long.labels(Work.RESOLVE))
 
     @property
     def solving_motion(self) -> bool:
         """Whether a Resolve of a motion runs."""
-        return bool(self._label(Work.RESOLVE_MOTION))
+        return bool(self._long.labels(Work.RESOLVE_MOTION))
 
     @property
     def preparing(self) -> bool:
         """Whether predictions and drags are not ready yet."""
-        return bool(self._label(Work.PREPARE))
+        return bool(self._long.labels(Work.PREPARE))
 
     @property
     def incoming(self) -> str:
         """The label of the work that loads another pose or model, or ""."""
-        return self._label(Work.INCOMING)
+        return "".join(self._long.labels(Work.INCOMING))
 
     @property
     def changing_model(self) -> bool:
         """Whether a change of body parts or contact rules is pending: one at a time."""
-        return bool(self._label(Work.CHANGE_MODEL))
+        return bool(self._long.labels(Work.CHANGE_MODEL))
 
     @property
     def n_exports(self) -> int:
         """The number of files waiting to be written."""
-        return sum(bool(self._long.label_of(number)) for number in self._exports)
+        return len(self._long.labels(_EXPORT))
 
     def cancel_incoming(self) -> None:
         """Stop loading another pose or model."""
@@ -207,28 +200,24 @@ class Tasks(QObject):
     def forget_model(self) -> None:
         """Stop all work for the present model, except exports, which have their snapshots."""
         self.cancel_resolve()
-        self.cancel(*Work)
+        self._long.cancel(*Work)
         self.proposed_rules, self.offers_rules = None, False
         self._prepared = False
 
     def cancel_all(self) -> None:
         """Stop all long work except preparing the model; `message` names what was cancelled."""
         self.cancel_resolve()
-        self.cancel_exports()
-        named_works = (Work.INCOMING, Work.CHANGE_MODEL, Work.RESOLVE_MOTION)
-        self._cancel_told([self._numbers.get(work, 0) for work in named_works])
-        self._long.cancel_all(but=self._numbers.get(Work.PREPARE, 0))
+        self._cancel_told(_EXPORT, Work.INCOMING, Work.CHANGE_MODEL, Work.RESOLVE_MOTION)
+        self._long.cancel_all(but=Work.PREPARE)
 
     @Slot()
     def cancel_exports(self) -> None:
         """Stop all exports; `message` names them."""
-        exports, self._exports = self._exports, []
-        self._cancel_told(exports)
+        self._cancel_told(_EXPORT)
 
-    def _cancel_told(self, numbers: list[int]) -> None:
-        labels = [label for number in numbers if (label := self._long.label_of(number))]
-        for number in numbers:
-            self._long.cancel(number)
+    def _cancel_told(self, *kinds: object) -> None:
+        labels = self._long.labels(*kinds)
+        self._long.cancel(*kinds)
         for label in labels:
             self.message.emit(f"{label} was cancelled")
 
@@ -473,9 +462,7 @@ class Tasks(QObject):
         work : returns the message for the status bar, unless there is `done`
         done : called in this thread with the work's value instead
         """
-        self._exports.append(self._long.start(label, work, done or self.message.emit))
-        # Only now does it count in `n_exports`.
-        self.busy_changed.emit(self.busy)
+        self._long.start(label, work, done or self.message.emit, kind=_EXPORT)
 
     # Resolve.
 
@@ -523,14 +510,6 @@ class Tasks(QObject):
             self.solve_finished.emit(None)
 
     # The results of the workers.
-
-    @Slot(int, int, int)
-    def _on_progressed(self, number: int, done: int, total: int) -> None:
-        self.progressed.emit(done, total)
-        if number == self._numbers.get(Work.RESOLVE):
-            self.solve_progressed.emit(done, total)
-        elif number == self._numbers.get(Work.RESOLVE_MOTION):
-            self.motion_progressed.emit(done, total)
 
     def _on_model(self, opened: OpenedModel) -> None:
         self.model_opened.emit(opened)

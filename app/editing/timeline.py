@@ -164,6 +164,9 @@ AHEAD = 24
 EASING = 12
 """Default number of frames, at 30 per second, over which an edit by hand eases in and out."""
 
+_CLIP, _TRAIL = "clip", "trail"
+"""Kinds of reading jobs."""
+
 _STOPPED = "Resolve was stopped: the motion has changed"
 
 
@@ -237,7 +240,6 @@ class Timeline(QObject):
         self.onion = Onion()
         self.trail: int | None = None
         self.trail_points: npt.NDArray[np.float64] | None = None
-        self._following = self._choosing = 0
         self.comparing = self._waits = False
         self._motion: Motion | None = None
         self.resolving = MotionResolve(self, tasks)
@@ -283,7 +285,7 @@ class Timeline(QObject):
     @property
     def is_reading(self) -> bool:
         """Whether the motion that was chosen is being read."""
-        return bool(self._reading.label_of(self._choosing))
+        return bool(self._reading.labels(_CLIP))
 
     @property
     def is_of_character(self) -> bool:
@@ -322,7 +324,7 @@ class Timeline(QObject):
 
     def choose(self, name: str, enters: bool = True) -> None:
         """Put another motion on the timeline once it is read; with `enters`, go to frame 0."""
-        self._reading.cancel(self._choosing)
+        self._reading.cancel(_CLIP)
         motion = self.motions.get(name)
         if motion is not None:
             self._on_clip(enters, [motion])
@@ -331,7 +333,7 @@ class Timeline(QObject):
         # Use the reading thread: preparing drags would block the other one.
         job = partial(read_motions, self._history.model, self.file, name)
         done = partial(self._on_clip, enters)
-        self._choosing = self._reading.start(f"Reading {name}", job, done)
+        self._reading.start(f"Reading {name}", job, done, kind=_CLIP)
 
     def choose_joints(self, followed: JointMap) -> None:
         """Remember which joint of the body follows which, and read the motions again."""
@@ -372,7 +374,7 @@ class Timeline(QObject):
     def _open_motions(self, file: Path | None, motions: Mapping[str, Motion | None]) -> None:
         from lcollision_core.files import file_stamp
 
-        self._reading.cancel(self._choosing)
+        self._reading.cancel(_CLIP)
         self.file, self.file_stamp = file, None if file is None else file_stamp(file)
         self.motions, self._edited, self._saved = dict(motions), {}, {}
         self.joints = self.joints_of = None
@@ -581,11 +583,11 @@ class Timeline(QObject):
     def _follow_trail(self) -> None:
         motion = self.motion
         # Cancel only this job: the thread also reads motions.
-        self._reading.cancel(self._following)
+        self._reading.cancel(_TRAIL)
         if self.trail is not None and motion is not None:
             frames = range(self.first, self.last + 1)
             job = partial(path_of_vertex, self._history.model, motion, frames, self.trail)
-            self._following = self._reading.start("Following a point", job, self._on_trail)
+            self._reading.start("Following a point", job, self._on_trail, kind=_TRAIL)
 
     def _on_trail(self, points: npt.NDArray[np.float64]) -> None:
         self.trail_points = points
@@ -737,7 +739,7 @@ class Timeline(QObject):
             self._pose.show_own()
             self.options_changed.emit()
         self.moved.emit()
-        if self.onion.before or self.onion.after:
+        if self.onion.count:
             self.onion_changed.emit()
 
     def _hold_solid(self, now: Motion) -> None:

@@ -96,8 +96,8 @@ class StatusBar(QStatusBar):
         self._reason = self._reason if work else ""
         self._show()
 
-    @Slot(int, int)
-    def show_progress(self, done: int, total: int) -> None:
+    @Slot(object, int, int)
+    def show_progress(self, _: object, done: int, total: int) -> None:
         """Show how many steps of the total are done."""
         if self._work:
             self._bar.setRange(0, max(1, total))

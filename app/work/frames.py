@@ -97,20 +97,6 @@ class PoseFrame:
         return self.found is not None and not self.found.counted_only
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredFrame:
-    """A frame with the nearest pair of its surface.
-
-    Attributes
-    ----------
-    frame : of the pose
-    nearest : None if no pair is nearer than `DISTANCE_BOUND`
-    """
-
-    frame: PoseFrame
-    nearest: NearestPair | None
-
-
 class FrameEvaluator:
     """Computes frames and exact checks of one model; for one thread at a time.
 
@@ -131,20 +117,19 @@ class FrameEvaluator:
     def frame(
         self,
         latent: FloatArray,
-        checks: bool = True,
-        placement: RigidTransform | None = None,
         space: PoseSpace | None = None,
+        checks: bool = True,
     ) -> PoseFrame:
         """Decode, shade and predict one pose, and check it if that is quick.
 
         Parameters
         ----------
         latent : (D,) finite array
+        space : of a motion's frame; None for any other pose
         checks : False omits the exact check
-        placement, space : of a motion's frame: see `ExactCheck`
         """
         start = time.thread_time()
-        check = self.model.exact_check(placement, space)
+        check = self.model.exact_check(space=space)
         vertices = check.drawn(check.decode(latent)[0])
         is_quick = (
             checks and self._checks and statistics.median(self._checks) < _QUICK_CHECK_SECONDS
@@ -178,13 +163,11 @@ class FrameEvaluator:
         """Check the vertices of a frame exactly."""
         return replace(frame, found=self._found(frame.vertices))
 
-    def measured(self, frame: PoseFrame) -> MeasuredFrame:
-        """Find the nearest pair of a frame's surface."""
+    def nearest(self, frame: PoseFrame) -> NearestPair | None:
+        """Find the nearest pair of a frame's surface; None if none is nearer than the bound."""
         from lcollision_core.contact import DISTANCE_BOUND
 
-        return MeasuredFrame(
-            frame, self.model.detector.least_distance(frame.vertices, DISTANCE_BOUND)
-        )
+        return self.model.detector.least_distance(frame.vertices, DISTANCE_BOUND)
 
     def _drawn(
         self,
@@ -243,30 +226,6 @@ def _frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class CodeTarget:
-    """Codes for the pose to reach, as set by sliders.
-
-    Attributes
-    ----------
-    aim : (D,) float64 array, read-only
-    """
-
-    aim: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class GripTarget:
-    """Target of a dragged patch or twist.
-
-    Attributes
-    ----------
-    aim : float64 array, read-only: (3,) point, or (1,) angle of a twist; see `PoseDragger.move`
-    """
-
-    aim: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class MotionStart:
     """The constant part of a motion towards changing targets.
 
@@ -276,7 +235,8 @@ class MotionStart:
     grip : the dragged patch or twist; None if the targets are codes
     pins : patches that stay in place
     options : of the drag
-    placement, space : of the pose, as in `PoseRequest`
+    placement : of the exported pose
+    space : of a motion's frame; None for any other pose
     """
 
     latent: FloatArray
@@ -284,79 +244,64 @@ class MotionStart:
     pins: tuple[Pin, ...]
     options: DragOptions
     placement: RigidTransform | None
-    space: SpaceFactory | None = None
+    space: SpaceFactory | None
 
 
 @dataclass(frozen=True, eq=False)
 class PoseRequest:
-    """A request for a `PoseFrame`.
+    """A request for a `PoseFrame`, or for more about one.
 
     Attributes
     ----------
     model : of the pose
-    target : the codes to show, or with a `start` the target to move towards
+    target : (D,) codes to show, or with a `start` to move towards; for the grip of a start a (3,)
+        point, or the (1,) angle of a twist
     start : of the motion; the worker begins a new drag when it changes
     predicts : whether the frame gets a prediction
-    unchecked : a frame to check exactly instead
-    unmeasured : a frame to measure instead
-    placement : of the exported pose
     space : of a motion's frame; None for any other pose
+    resting : a frame to check exactly instead, or to measure if it is checked
     """
 
     model: Body
-    target: CodeTarget | GripTarget | None
+    target: FloatArray | None = None
     start: MotionStart | None = None
     predicts: bool = False
-    unchecked: PoseFrame | None = None
-    placement: RigidTransform | None = None
     space: SpaceFactory | None = None
-    unmeasured: PoseFrame | None = None
-
-    @property
-    def is_of_rest(self) -> bool:
-        """Whether it checks or measures an existing frame, because its pose rests."""
-        return self.unchecked is not None or self.unmeasured is not None
+    resting: PoseFrame | None = None
 
     @property
     def kind(self) -> str:
         """The kind of request; a failure that repeats within a kind is reported once."""
-        if self.unchecked is not None:
-            return "check"
-        if self.unmeasured is not None:
-            return "measure"
+        if self.resting is not None:
+            return "measure" if self.resting.is_checked else "check"
         return "frame" if self.start is None else "motion"
 
 
 class PoseWorker:
-    """Answers requests, with a `PoseFrame` each, or a `MeasuredFrame`; for one thread."""
+    """Answers requests, most with a `PoseFrame`; for one thread."""
 
     def __init__(self) -> None:
         self._evaluator: FrameEvaluator | None = None
         self._start: MotionStart | None = None
         self._dragger: PoseDragger | None = None
 
-    def answer(self, request: PoseRequest) -> PoseFrame | MeasuredFrame:
-        """Answer one request."""
-        evaluator = self._evaluator
+    def answer(self, request: PoseRequest) -> PoseFrame | NearestPair | None:
+        """Answer one request; measuring finds the nearest pair."""
+        evaluator, resting = self._evaluator, request.resting
         if evaluator is None or evaluator.model is not request.model:
             self._evaluator = evaluator = FrameEvaluator(request.model)
             evaluator.predicts = False
             # The dragger belongs to the previous model.
             self._start = self._dragger = None
-        if request.unchecked is not None:
-            return evaluator.checked(request.unchecked)
-        if request.unmeasured is not None:
-            return evaluator.measured(request.unmeasured)
+        if resting is not None:
+            return evaluator.nearest(resting) if resting.is_checked else evaluator.checked(resting)
         if request.predicts and not evaluator.predicts:
             keep_torch_to_one_thread(request.model)
             evaluator.predicts = True
         assert request.target is not None
         if request.start is None:
-            if request.space is None:
-                return evaluator.frame(request.target.aim)
-            frame_space = request.space()
-            return evaluator.frame(request.target.aim, True, request.placement, frame_space)
-        return evaluator.moved(self._begun(request.model, request.start), request.target.aim)
+            return evaluator.frame(request.target, request.space and request.space())
+        return evaluator.moved(self._begun(request.model, request.start), request.target)
 
     def _begun(self, model: Body, start: MotionStart) -> PoseDragger:
         """Return the dragger of a motion, and begin its drag if it is new."""
@@ -376,7 +321,7 @@ class PoseMailbox(QObject):
 
     Signals
     -------
-    answered : PoseRequest and its Response, whose value is a PoseFrame or a MeasuredFrame
+    answered : PoseRequest and its Response; see `PoseWorker.answer`
     """
 
     answered = Signal(object, object)
@@ -438,7 +383,6 @@ class PoseMailbox(QObject):
         request, self._asked = self._asked, None
         if request is not None:
             self.answered.emit(request, answer)
-            self.send()
 
 
 MOST_BYTES = 96 * 2**20
@@ -453,19 +397,17 @@ class Onion:
 
     Attributes
     ----------
-    before, after : how many; 0 for none
+    count : how many before and after the playhead; 0 for none
     step : distance between them, in frames
     """
 
-    before: int = 0
-    after: int = 0
+    count: int = 0
     step: int = 4
 
     def frames(self, at: int, n_frames: int) -> list[int]:
         """Return the onion skin frames around a frame, nearest first."""
-        offsets = [-k * self.step for k in range(1, self.before + 1)]
-        offsets += [k * self.step for k in range(1, self.after + 1)]
-        return [at + by for by in sorted(offsets, key=abs) if 0 <= at + by < n_frames]
+        away = [k * self.step for k in range(1, self.count + 1)]
+        return [at + by for k in away for by in (-k, k) if 0 <= at + by < n_frames]
 
 
 class FrameCache(QObject):
@@ -536,7 +478,7 @@ class FrameCache(QObject):
             keep_torch_to_one_thread(model)
         evaluator.predicts = predicts
         frame_space = motion.space(number, model.space)
-        return evaluator.frame(motion.codes[number], False, motion.placement(number), frame_space)
+        return evaluator.frame(motion.codes[number], frame_space, checks=False)
 
     def _next_wanted(self) -> tuple[Body, Motion, int, bool] | None:
         """Return the next frame to compute; None if nothing is left."""

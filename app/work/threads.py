@@ -124,6 +124,7 @@ class _Started:
     """A job that has not ended; see `LongWork.start`."""
 
     label: str
+    kind: object
     job: Job
     done: Callable[[Any], None]
     failed: Callable[[Failure], None]
@@ -136,13 +137,13 @@ class LongWork(QObject):
     -------
     busy_changed : str, the label of the oldest unfinished job, "" if there is none
     idle : the last job has ended
-    progressed : three ints, the job's number, its steps done and their total
+    progressed : a job's kind, its steps done and their total
     failed : Failure of a job that was started without `failed`
     """
 
     busy_changed = Signal(str)
     idle = Signal()
-    progressed = Signal(int, int, int)
+    progressed = Signal(object, int, int)
     failed = Signal(object)
 
     _reported = Signal(int, int, int)
@@ -162,9 +163,9 @@ class LongWork(QObject):
         """The label of the running job, or ""."""
         return next((job.label for job in self._jobs.values()), "")
 
-    def label_of(self, number: int) -> str:
-        """Return the label of a job, or "" if it is done."""
-        return self._jobs[number].label if number in self._jobs else ""
+    def labels(self, *kinds: object) -> list[str]:
+        """Return the labels of the unfinished jobs of these kinds, oldest first."""
+        return [job.label for job in self._jobs.values() if job.kind in kinds]
 
     def start(
         self,
@@ -172,7 +173,8 @@ class LongWork(QObject):
         work: Task,
         done: Callable[[Any], None],
         failed: Callable[[Failure], None] | None = None,
-    ) -> int:
+        kind: object = "",
+    ) -> None:
         """Queue work behind the jobs started before.
 
         Parameters
@@ -182,17 +184,13 @@ class LongWork(QObject):
         done : called in this thread with the work's value; not after `cancel`
         failed : called in this thread with the `Failure` of the work; by default the signal
             `failed` is emitted
-
-        Returns
-        -------
-        number : of the job
+        kind : by which the job is asked for and cancelled
         """
         self._last_id += 1
         number, job = self._last_id, Job()
-        self._jobs[number] = _Started(label, job, done, failed or self.failed.emit)
+        self._jobs[number] = _Started(label, kind, job, done, failed or self.failed.emit)
         self._thread.submit(self._run, number, label, work, job)
         self.busy_changed.emit(self.busy)
-        return number
 
     def _run(self, number: int, label: str, work: Task, job: Job) -> None:
         """Run a job in the other thread; its errors become its response."""
@@ -204,17 +202,19 @@ class LongWork(QObject):
 
         self._answered.emit(number, guarded(label, run))
 
-    def cancel(self, number: int) -> None:
-        """Stop a job, which signals nothing more. Does nothing if it is done."""
-        job = self._jobs.pop(number, None)
-        if job is not None:
-            job.job.cancel()
-            self.busy_changed.emit(self.busy)
+    def cancel(self, *kinds: object) -> None:
+        """Stop the unfinished jobs of these kinds, which signal nothing more."""
+        self._cancel([number for number, job in self._jobs.items() if job.kind in kinds])
 
-    def cancel_all(self, but: int = 0) -> None:
-        """Stop all jobs, or all but one."""
-        for number in set(self._jobs) - {but}:
-            self.cancel(number)
+    def cancel_all(self, but: object = None) -> None:
+        """Stop all jobs, or all but those of a kind."""
+        self._cancel([number for number, job in self._jobs.items() if job.kind != but])
+
+    def _cancel(self, numbers: list[int]) -> None:
+        for number in numbers:
+            self._jobs.pop(number).job.cancel()
+        if numbers:
+            self.busy_changed.emit(self.busy)
 
     def close(self, deadline: float) -> bool:
         """Cancel all jobs and end the thread; see `WorkerThread.end`."""
@@ -224,7 +224,7 @@ class LongWork(QObject):
     @Slot(int, int, int)
     def _on_reported(self, number: int, done: int, total: int) -> None:
         if number in self._jobs:
-            self.progressed.emit(number, done, total)
+            self.progressed.emit(self._jobs[number].kind, done, total)
 
     @Slot(int, object)
     def _on_answered(self, number: int, answer: Response) -> None:

@@ -163,7 +163,7 @@ def _begin(qtbot: QtBot, document: PoseDocument, model: LearnedBody) -> None:
             motion.frame is not None
             and motion.frame.prediction is not None
             and motion.exact is not None
-            and motion.unchecked is None
+            and (motion.resting is None or motion.resting.is_checked)
         )
 
     qtbot.waitUntil(is_settled, timeout=20_000)

@@ -11,7 +11,6 @@ from PySide6.QtCore import Qt
 from app.view.shading import Shading
 from app.window.command import EditorWindow, Menu, called, greyed, in_view, ticked, unless
 from app.window.dialogs.joints import JointsDialog
-from app.work.frames import Onion
 
 if TYPE_CHECKING:
     from app.editing.timeline import Timeline
@@ -237,10 +236,10 @@ _ONIONS = MOTION.choices("Onion s&kin")
 
 def _onion(count: int, text: str, tip: str) -> None:
     @_ONIONS.command(f"onion_{count}", text, f"Alt+Shift+{count}", tip)
-    @ticked(lambda window: _timeline(window).onion.before == count)
+    @ticked(lambda window: _timeline(window).onion.count == count)
     def choose(window: EditorWindow) -> None:
         timeline = _timeline(window)
-        timeline.set_onion(replace(timeline.onion, before=count, after=count))
+        timeline.set_onion(replace(timeline.onion, count=count))
 
 
 _onion(0, "&None", "Show the frame alone")
@@ -259,7 +258,7 @@ def _step(step: int) -> None:
     @ticked(lambda window: _timeline(window).onion.step == step)
     def choose(window: EditorWindow) -> None:
         timeline = _timeline(window)
-        timeline.set_onion(Onion(timeline.onion.before, timeline.onion.after, step))
+        timeline.set_onion(replace(timeline.onion, step=step))
 
 
 for _frames in (1, 2, 4, 8):

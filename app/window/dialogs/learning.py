@@ -100,7 +100,6 @@ class LearningDialog(Dialog):
         self._shown: tuple[Path, RunState, bool] | None = None
         self._card_of: Path | None = None
         self._read_for: Path | None = None
-        self._reading = 0
         self.which = described(QComboBox(), "", "Model being learned")
         self._sign = ThemedIcon(_SIGN)
         self.headline = labelled("", "headline", wraps=True)
@@ -122,7 +121,7 @@ class LearningDialog(Dialog):
         """Cancel reading a model, and close."""
         if self.path is not None:
             self.closed.emit(self.path)
-        self._work.cancel(self._reading)
+        self._work.cancel(self)
         self.path = self._read_for = None
         super().done(result)
 
@@ -215,11 +214,11 @@ class LearningDialog(Dialog):
             widget.setVisible(is_shown)
         self.discard.setEnabled(state != RunState.STOPPING)
         if is_done and run.path not in (self._card_of, self._read_for):
-            self._work.cancel(self._reading)
+            self._work.cancel(self)
             self._read_for = run.path
             read = partial(learning_runs.read_card, run.status.model)
             done = partial(self._on_card, run.path)
-            self._reading = self._work.start("Reading the model", read, done, self._on_no_card)
+            self._work.start("Reading the model", read, done, self._on_no_card, self)
         if self._shown != (run.path, state, collides):
             self._shown = run.path, state, collides
             self.resume.setText("Train anyway" if collides else "Continue")

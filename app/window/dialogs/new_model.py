@@ -616,7 +616,6 @@ class NewModelDialog(Dialog):
         FileDrops(self).dropped.connect(self.add)
         self.resize(_SIZE.boundedTo(screen_of(parent).size() - _MARGIN))
         self._work, self._settings = work, settings
-        self._reading = 0
         self._summary: SourcesSummary | None = None
         self.files, self.poses, self.contacts = FilesPage(), PosesPage(), ContactsPage()
         self.quality = QualityPage(why_no_model_name)
@@ -655,7 +654,7 @@ class NewModelDialog(Dialog):
 
     def done(self, result: int) -> None:
         """Cancel reading, and close."""
-        self._work.cancel(self._reading)
+        self._work.cancel(self)
         super().done(result)
 
     def _lay_out(self) -> None:
@@ -722,7 +721,7 @@ class NewModelDialog(Dialog):
     @Slot()
     def _read(self) -> None:
         """Read the files again, in a worker thread."""
-        self._work.cancel(self._reading)
+        self._work.cancel(self)
         self._summary = None
         self._facts.clear()
         paths = self.files.paths
@@ -731,7 +730,7 @@ class NewModelDialog(Dialog):
         self._on_changed()
         if paths:
             work = partial(learning_runs.look_into_sources, paths)
-            self._reading = self._work.start("Reading files", work, self._on_read, self._on_unread)
+            self._work.start("Reading files", work, self._on_read, self._on_unread, self)
 
     @Slot()
     def _show_body(self) -> None:

@@ -32,6 +32,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from app.editing.tasks import Work
 from app.view.shading import FULL_PREDICTED
 from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, TIGHT, current_theme, give_icon
 from app.window.layout import Docking
@@ -466,7 +467,7 @@ class ResolveCard(Card):
         self.add(self.stack, clearance, self._locked)
         resolve_action.changed.connect(self._on_action)
         document.tasks.solve_started.connect(self._on_started)
-        document.tasks.solve_progressed.connect(self._on_progressed)
+        document.tasks.progressed.connect(self._on_progressed)
         document.tasks.solve_finished.connect(self._on_finished)
         document.motion.locks_changed.connect(self._on_locks)
         self.clearance.valueChanged.connect(self._on_chosen)
@@ -511,9 +512,9 @@ class ResolveCard(Card):
         if had_focus:
             button.setFocus()
 
-    @Slot(int, int)
-    def _on_progressed(self, done: int, total: int) -> None:
-        if done > 0:
+    @Slot(object, int, int)
+    def _on_progressed(self, work: object, done: int, total: int) -> None:
+        if work is Work.RESOLVE and done > 0:
             self.bar.setRange(0, total)
             self.bar.setValue(done)
 

@@ -453,13 +453,13 @@ def test_a_frame_of_the_pose_that_comes_late_does_not_take_the_place_of_what_is_
 
 
 def test_frames_round_the_playhead_show_through(qtbot: QtBot, timeline: Timeline) -> None:
-    timeline.set_onion(Onion(before=2, after=1, step=3))
+    timeline.set_onion(Onion(count=2, step=3))
     timeline.go_to(4)
-    qtbot.waitUntil(lambda: len(timeline.onion_frames()) == 2)
-    # The second frame before the playhead would be before the motion.
-    assert sorted(by for by, _ in timeline.onion_frames()) == [-3, 3]
-    timeline.go_to(20)
     qtbot.waitUntil(lambda: len(timeline.onion_frames()) == 3)
+    # The second frame before the playhead would be before the motion.
+    assert sorted(by for by, _ in timeline.onion_frames()) == [-3, 3, 6]
+    timeline.go_to(20)
+    qtbot.waitUntil(lambda: len(timeline.onion_frames()) == 4)
     for by, frame in timeline.onion_frames():
         assert frame.latent.tobytes() == now(timeline).codes[20 + by].tobytes()
 
@@ -736,7 +736,7 @@ def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
 
     far = np.abs(model.decode(motion.codes[2]) - home(2)).max()
     assert far > 0.004 * size
-    timeline.set_onion(Onion(before=1, after=1, step=1))
+    timeline.set_onion(Onion(count=1, step=1))
     for number in (0, 2, 3, 2):
         timeline.go_to(number)
         np.testing.assert_allclose(drawn(), home(number), atol=2e-6 * size)

@@ -15,6 +15,7 @@ from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
+from app.editing.tasks import Work
 from app.window.memory import GarbageCollector
 from app.work.frames import FrameEvaluator, PoseFrame
 from app.work.threads import Failure, LongWork
@@ -79,7 +80,7 @@ def test_a_late_frame_is_not_told_after_the_one_that_follows_it(
     begun: list[float] = []
     held = {0.1: threading.Event(), 0.2: threading.Event()}
 
-    def starved(evaluator: FrameEvaluator, latent: npt.NDArray[np.float64]) -> PoseFrame:
+    def starved(evaluator: FrameEvaluator, latent: npt.NDArray[np.float64], _: None) -> PoseFrame:
         """Report a short time, but be late, like a thread that gets no core."""
         begun.append(latent[0])
         frame = compute(evaluator, latent)
@@ -117,7 +118,7 @@ def test_a_verdict_of_a_pose_that_has_moved_on_is_not_told(
         checking.set()
         go_on.wait(120)
         checked = check(evaluator, frame)
-        if document.motion.unchecked is frame:
+        if document.motion.resting is frame:
             frames.append(checked)
         return checked
 
@@ -219,9 +220,9 @@ def test_progress_of_a_solve_is_told(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, ended = endless_resolve(monkeypatch)
-    with qtbot.waitSignal(document.tasks.solve_progressed) as told:
+    with qtbot.waitSignal(document.tasks.progressed) as told:
         document.tasks.resolve()
-    assert told.args == [1, 2]
+    assert told.args == [Work.RESOLVE, 1, 2]
     document.tasks.cancel_resolve()
     qtbot.waitUntil(ended.is_set)
 
@@ -286,7 +287,8 @@ def test_a_quick_check_comes_with_its_frame_and_a_slow_one_when_the_pose_rests(
                 pass
             assert (document.motion.frame.found is not None) == comes_with_frame
             settle(qtbot, document)
-            assert document.motion.unchecked is None
+            resting = document.motion.resting
+            assert resting is None or resting.is_checked
 
 
 def test_a_verdict_that_fails_from_pose_to_pose_is_told_once(
@@ -317,7 +319,7 @@ def test_a_frame_of_another_model_is_not_shown(
     started, go_on = threading.Event(), threading.Event()
     compute = FrameEvaluator.frame
 
-    def slow(evaluator: FrameEvaluator, latent: np.ndarray) -> PoseFrame:
+    def slow(evaluator: FrameEvaluator, latent: np.ndarray, _: None) -> PoseFrame:
         started.set()
         go_on.wait(120)
         return compute(evaluator, latent)
@@ -347,11 +349,11 @@ def test_jobs_run_in_turn_and_a_cancelled_one_is_not_heard_of(qtbot: QtBot) -> N
         while True:
             job.check()
 
-    first = work.start("first", endless, done.append)
+    work.start("first", endless, done.append, kind="endless")
     work.start("second", lambda *_: "second", done.append)
     qtbot.waitUntil(started.is_set)
     assert done == []
-    work.cancel(first)
+    work.cancel("endless")
     qtbot.waitUntil(lambda: done == ["second"])
     assert work.busy == ""
     assert labels == ["first", "first", "second", ""]
