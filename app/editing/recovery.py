@@ -32,14 +32,13 @@ from app.editing.timeline import EditedMotions
 from app.work.preparing import open_poses_to_show, open_to_show
 from app.work.threads import Failure, LongWork, Task, guarded, single_shot
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files.safe import read_regular, require_regular, write_bytes
+from lcollision_core.files.safe import FileStamp, read_regular, require_regular, write_bytes
 from lcollision_core.jobs import Job
-from lcollision_core.json_values import from_json, parse_json, to_json
+from lcollision_core.json_values import convert_checked, from_json, parse_json, to_json
 from lcollision_core.tasks.opening import OpenedModel, ReadPoses, own_motions, read_motions
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, NamedPose, OtherModelError
-    from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion
 
 
@@ -111,6 +110,31 @@ class Session:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
+@dataclass(frozen=True)
+class SessionNote:
+    """What a session keeps beside its poses.
+
+    Attributes
+    ----------
+    model : the file or the name of the model
+    pose_name : of the edited pose
+    file : the poses file that it was opened from or saved to
+    file_stamp : of `file` at that time, None if unknown
+    locked : the locked domains
+    motion : the name of the edited motion that the pose is a frame of, "" for none
+    motion_file, motion_stamp : the file that the motion was read from, and its stamp
+    """
+
+    model: str
+    pose_name: str
+    file: str | None
+    file_stamp: FileStamp | None = None
+    locked: tuple[int, ...] = ()
+    motion: str = ""
+    motion_file: str = ""
+    motion_stamp: FileStamp | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class RecoverablePose:
     """The unsaved pose of an editor that crashed.
@@ -118,36 +142,24 @@ class RecoverablePose:
     Attributes
     ----------
     session : locked by this process until it is discarded, released or recovered
-    model : the file or the name of its model
-    pose_name : of the edited pose
-    file : the poses file that it was opened from or saved to
-    locked : the locked domains
+    note : on the pose
     saved : when it was last written, in seconds since 1970
-    file_stamp : of `file` at that time, None if unknown
-    motion : the name of the edited motion that the pose is a frame of, "" for none
-    motion_file, motion_stamp : the file that the motion was read from, and its stamp
     """
 
     session: Session
-    model: str
-    pose_name: str
-    file: Path | None
-    locked: tuple[int, ...]
+    note: SessionNote
     saved: float
-    file_stamp: FileStamp | None = None
-    motion: str = ""
-    motion_file: Path | None = None
-    motion_stamp: FileStamp | None = None
 
     @property
     def motion_loss_reason(self) -> str:
         """Why the edits of its motion cannot be restored; "" if they can."""
-        return unreadable_reason(self.motion_file, self.motion_stamp) if self.motion_file else ""
+        file = self.note.motion_file
+        return unreadable_reason(Path(file), self.note.motion_stamp) if file else ""
 
     @property
     def model_name(self) -> str:
         """The display name of the model."""
-        return Path(self.model).stem
+        return Path(self.note.model).stem
 
     @property
     def poses_file(self) -> Path:
@@ -171,23 +183,11 @@ def find_recoverable_poses(parent: Path | None = None) -> list[RecoverablePose]:
         if session is None:
             continue
         try:
-            description = parse_json(read_regular(folder / _SESSION, _MAX_SESSION_BYTES))
-            lost = RecoverablePose(
-                session=session,
-                model=str(description["model"]),
-                pose_name=str(description["pose_name"]),
-                file=Path(description["file"]) if description["file"] else None,
-                file_stamp=_stamp(description.get("file_stamp")),
-                locked=tuple(map(int, description.get("locked", ()))),
-                saved=(folder / _POSES).stat().st_mtime,
-                motion=str(description.get("motion") or ""),
-                motion_file=Path(description["motion_file"])
-                if description.get("motion_file")
-                else None,
-                motion_stamp=_stamp(description.get("motion_stamp")),
-            )
-            lost_poses.append(lost)
-        except (OSError, ValueError, LookupError, TypeError, OverflowError) as error:
+            values = parse_json(read_regular(folder / _SESSION, _MAX_SESSION_BYTES))
+            # Not sanitised: a file may have any name.
+            note = convert_checked(SessionNote, values, "the session")
+            lost_poses.append(RecoverablePose(session, note, (folder / _POSES).stat().st_mtime))
+        except (OSError, ValueError) as error:
             _log.info("nothing to recover in %s: %s", folder, error)
             # A disk error may be temporary: keep the session.
             is_useless = getattr(error, "errno", errno.ENOENT) in (errno.ENOENT, errno.EFBIG)
@@ -250,10 +250,11 @@ class Autosave(QObject):
         If its model is gone, emit `PoseDocument.failed` and leave the session unchanged.
         """
         document = self._document
-        model = document.model if lost.model == document.history.model_file else None
-        work = partial(read_lost, model, lost.model, lost.poses_file)
+        file = lost.note.model
+        model = document.model if file == document.history.model_file else None
+        work = partial(read_lost, model, file, lost.poses_file)
         done = partial(self._on_read, lost)
-        document.tasks.start_loading(f"Recovering {lost.pose_name}", work, done)
+        document.tasks.start_loading(f"Recovering {lost.note.pose_name}", work, done)
 
     def close(self, timeout: float = 5.0, keep: bool = False) -> bool:
         """Stop, and discard unsaved edits unless they are kept for the next start.
@@ -304,17 +305,17 @@ class Autosave(QObject):
         document, folder = self._document, self._session.folder
         if not document.history.modified:
             return partial(_delete, folder)
-        session = {
-            "model": document.history.model_file,
-            "pose_name": document.history.pose.name,
-            "file": str(document.history.file) if document.history.file else None,
-            "file_stamp": document.history.file_stamp,
-            "locked": sorted(document.motion.locked_domains),
-        }
+        note = SessionNote(
+            document.history.model_file,
+            document.history.pose.name,
+            str(document.history.file) if document.history.file else None,
+            document.history.file_stamp,
+            tuple(sorted(document.motion.locked_domains)),
+        )
         return partial(
             _write,
             folder,
-            session,
+            note,
             document.model,
             document.history.file_poses,
             document.history.pose,
@@ -333,16 +334,17 @@ class Autosave(QObject):
         if read.opened is not None:
             document.tasks.model_opened.emit(read.opened)
         poses = read.content.poses
-        same_name = (pose for pose in poses if pose.name == lost.pose_name)
+        same_name = (pose for pose in poses if pose.name == lost.note.pose_name)
         edited = read.content.working or next(same_name, poses[0])
-        history.begin_with(edited, Source.FILE, lost.file, poses)
-        history.file_stamp = lost.file_stamp
+        file = Path(lost.note.file) if lost.note.file else None
+        history.begin_with(edited, Source.FILE, file, poses)
+        history.file_stamp = lost.note.file_stamp
         history.mark_unsaved()
         if self._session is not None:
             self._session.discard()
         self._session = lost.session
         for domain in range(len(document.model.domain_names)):
-            document.motion.set_locked(domain, domain in lost.locked)
+            document.motion.set_locked(domain, domain in lost.note.locked)
         if isinstance(motions, EditedMotions):
             document.timeline.restore(motions)
         self.recovered.emit()
@@ -365,16 +367,9 @@ class Autosave(QObject):
             self.failed.emit(Failure(headline, next_step, failure.details))
 
 
-def _stamp(value: list[int] | None) -> FileStamp | None:
-    if value is None:
-        return None
-    device, inode, size, modified = map(int, value)
-    return device, inode, size, modified
-
-
 def _write(
     folder: Path,
-    session: dict[str, Any],
+    note: SessionNote,
     model: Body,
     file_poses: tuple[NamedPose, ...],
     working: NamedPose,
@@ -388,13 +383,13 @@ def _write(
     if motions is not None:
         try:
             extra = {KEY: to_json_values(motions)}
-            file_of, stamp = str(motions.file.absolute()), motions.stamp
-            session |= {"motion": motions.open, "motion_file": file_of, "motion_stamp": stamp}
+            file, stamp = str(motions.file.absolute()), motions.stamp
+            note = replace(note, motion=motions.open, motion_file=file, motion_stamp=stamp)
         except LCollisionError as error:
             # The pose is still written.
             too_large = error
     write_poses(folder / _POSES, model, file_poses, working, extra)
-    write_bytes(folder / _SESSION, json.dumps(session).encode())
+    write_bytes(folder / _SESSION, json.dumps(to_json(note)).encode())
     if too_large is not None:
         raise too_large
     return True
@@ -431,7 +426,7 @@ class _StoredMotions:
     """`EditedMotions` as stored in a file."""
 
     file: str
-    stamp: tuple[int, int, int, int] | None
+    stamp: FileStamp | None
     open: str
     frame: int
     motions: tuple[_KeptMotion, ...]

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from app.editing.document import PoseDocument
     from app.editing.recovery import RecoverablePose
-    from app.view.pictures import Pictures
+    from app.view.offscreen import Pictures
     from lcollision_core.errors import WrongScaleError
 
 
@@ -147,22 +147,22 @@ def ask_about_recovery(parent: QWidget, lost: RecoverablePose) -> Choice:
     title, model = "Recover a pose", lost.model_name
     text = say(
         "The editor closed unexpectedly while the pose “{name}” of “{model}” was not saved.",
-        name=lost.pose_name,
+        name=lost.note.pose_name,
         model=model,
     )
-    if lost.motion:
+    if lost.note.motion:
         title = "Recover a motion"
         text = say(
             "The editor closed unexpectedly while the motion “{name}” of “{model}” was not "
             "exported.",
-            name=lost.motion,
+            name=lost.note.motion,
             model=model,
         )
     note = f"It was saved automatically on {moment.day} {moment:%B at %H:%M}. Recover it?"
     if lost.motion_loss_reason:
         note = (
-            f"As {lost.motion_loss_reason}, only the pose “{lost.pose_name}” can be recovered, "
-            "not the edits of the motion. Recover it?"
+            f"As {lost.motion_loss_reason}, only the pose “{lost.note.pose_name}” can be "
+            "recovered, not the edits of the motion. Recover it?"
         )
     return _ask(parent, title, text, note, ("Recover", "Delete it", "Ask later"))
 

@@ -135,9 +135,9 @@ def test_a_killed_editor_loses_nothing_that_was_written(
     folder = tmp_path / "sessions"
     let_die(EDITOR, model_file, folder)
     (lost,) = find_recoverable_poses(folder)
-    assert lost.pose_name == "kick"
-    assert Path(lost.model) == model_file
-    assert lost.file is None
+    assert lost.note.pose_name == "kick"
+    assert Path(lost.note.model) == model_file
+    assert lost.note.file is None
     # Another editor that starts now finds nothing: this one holds the session.
     assert find_recoverable_poses(folder) == []
 
@@ -172,7 +172,7 @@ def test_what_cannot_be_read_stays_for_another_day(model_file: Path, tmp_path: P
     (session / "session.json").rmdir()
     (session / "session.json").write_text(kept)
     (lost,) = find_recoverable_poses(folder)
-    assert lost.pose_name == "kick"
+    assert lost.note.pose_name == "kick"
     lost.session.discard()
     # A session without a pose is useless.
     session.mkdir()
@@ -294,7 +294,7 @@ def test_a_lock_that_changes_later_is_kept_too(
         document.motion.set_locked(0, True)
     autosave.close(keep=True)
     (lost,) = find_recoverable_poses(tmp_path / "sessions")
-    assert lost.locked == (0,)
+    assert lost.note.locked == (0,)
 
 
 @pytest.mark.usefixtures("autosave")
@@ -398,7 +398,11 @@ def test_a_killed_editor_loses_no_edit_of_a_motion(
     folder = tmp_path / "sessions"
     let_die(EDITOR_OF_MOTION, swing, folder)
     (lost,) = find_recoverable_poses(folder)
-    assert (lost.motion, lost.pose_name, lost.motion_loss_reason) == (CLIP, f"{CLIP} 7", "")
+    assert (lost.note.motion, lost.note.pose_name, lost.motion_loss_reason) == (
+        CLIP,
+        f"{CLIP} 7",
+        "",
+    )
     assert lost.poses_file.stat().st_size < 100_000
 
     autosave = Autosave(document, folder, seconds=1000.0)
@@ -426,7 +430,7 @@ def test_a_killed_editor_loses_no_edit_of_a_motion(
     timeline.go_to(9)
     assert autosave.close(keep=True)
     (lost,) = find_recoverable_poses(folder)
-    assert lost.pose_name == f"{CLIP} 9"
+    assert lost.note.pose_name == f"{CLIP} 9"
     lost.session.release()
 
 
@@ -533,7 +537,7 @@ def test_a_motion_of_another_file_that_is_gone_leaves_its_pose(
     document.timeline.mark_saved()
     document.new_pose()
     (lost,) = find_recoverable_poses(tmp_path / "sessions")
-    assert (lost.motion, lost.motion_loss_reason) == ("walk", "")
+    assert (lost.note.motion, lost.motion_loss_reason) == ("walk", "")
     path.rename(tmp_path / "elsewhere.json")
     assert lost.motion_loss_reason == "walk.json is gone"
     autosave = Autosave(document, tmp_path / "sessions", seconds=1000.0)
@@ -561,7 +565,7 @@ def test_edits_beyond_the_bound_are_told_of_and_the_pose_is_kept(
     assert failed.args[0].next_step == "export the motion"
     assert autosave.close(keep=True)
     (lost,) = find_recoverable_poses(tmp_path / "sessions")
-    assert lost.motion == ""
+    assert lost.note.motion == ""
     (pose,) = read_poses(lost.poses_file, document.model)
     assert pose.latent.tobytes() == motion.codes[20].tobytes()
     lost.session.release()

@@ -12,7 +12,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QDialog, QMenu, QToolBar, QToolButton
 from pytestqt.qtbot import QtBot
 
-from app.editing.recovery import RecoverablePose, Session
+from app.editing.recovery import RecoverablePose, Session, SessionNote
 from app.window.dialogs.questions import ask_about_recovery, ask_to_replace, ask_to_switch
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import LearnedBody, user_models_folder
@@ -120,7 +120,7 @@ def test_no_title_is_cut(window: MainWindow, tmp_path: Path) -> None:
         widths.append(dialog.width())
         dialog.reject()
 
-    lost = RecoverablePose(Session.new(tmp_path), "tube", "kick", None, (), time.time())
+    lost = RecoverablePose(Session.new(tmp_path), SessionNote("tube", "kick", None), time.time())
     window.document.library.add_pose("kick")
     window.document.motion.set_code(0, 0.5)
     window.library.choose_own("kick")
