@@ -27,7 +27,6 @@ from app.editing.live_pose import RADIUS_STEP, domain_of, part_name
 from app.view.camera import (
     DragTarget,
     Pixel,
-    View,
     along_axis,
     pixel_length,
     shifted,
@@ -383,7 +382,7 @@ _HINTS = (
 
 _WHOLE_BODY_HINT = "Ctrl+Shift-drag: move the whole body"
 
-_Drag = Callable[[QPointF], None]
+_Drag = Callable[[QPointF, QPointF], None]
 
 _SMALL, _SMALL_ROOT, _FAR_AWAY = 300.0, 4500.0, 30_000.0
 """Screen areas, in square pixels, of all faces: a body part below the first has a handle. The root
@@ -448,7 +447,7 @@ class Mouse(QObject):
     ----------
     document : whose pose is dragged
     canvas : source of the mouse events
-    scene : returns the scene on the canvas, None before there is one
+    scene : returns the scene on the canvas
 
     Attributes
     ----------
@@ -477,10 +476,10 @@ class Mouse(QObject):
         self,
         document: PoseDocument,
         canvas: Canvas,
-        scene: Callable[[], Scene | None],
+        scene: Callable[[], Scene],
     ) -> None:
         super().__init__(canvas)
-        self._document, self._canvas, self._scene = document, canvas, scene
+        self._document, self._canvas, self._scene_now = document, canvas, scene
         self.vertex: int | None = None
         self.pin: int | None = None
         self.handle: int | None = None
@@ -490,6 +489,7 @@ class Mouse(QObject):
         self._last_vertex: int | None = None
         self._keeps = False
         self._drag: _Drag | None = None
+        self._place = QPointF()
         self._grip: Grip | None = None
         self._target: FloatArray | None = None
         self._deepen: Callable[[float], None] | None = None
@@ -519,20 +519,17 @@ class Mouse(QObject):
     def point_at(self, place: QPointF | None) -> None:
         """Find the pin, handle or vertex under the pointer, and show the patch of a drag."""
         self.vertex = self.pin = self.handle = None
-        scene = self._scene()
-        if scene is not None and place is not None:
+        scene = self._scene
+        if place is not None:
             # Pins may have changed since the last picture.
-            self._mark_pins(scene)
+            self._mark_pins()
             self.pin = scene.marks.pin_at(_pixel(place), scene.view, self._size)
             handle = scene.marks.handle_at(_pixel(place), scene.view, self._size)
             if self.pin is not None:
                 self.vertex = self._document.history.pose.pins[self.pin].vertex
             elif handle is not None:
-                visible_handles = [handle for handle in self._handles if handle.is_shown]
-                self.handle, self.vertex = (
-                    visible_handles[handle].domain,
-                    visible_handles[handle].grip.vertex,
-                )
+                pointed = [handle for handle in self._handles if handle.is_shown][handle]
+                self.handle, self.vertex = pointed.domain, pointed.grip.vertex
             else:
                 picked = self._canvas.pick(place, scene.body)
                 self.vertex = None if picked is None else picked[0]
@@ -572,50 +569,38 @@ class Mouse(QObject):
             self.arrows = self.vertex
         self.redraw_wanted.emit()
 
-    def mark(self, scene: Scene, vertices: npt.NDArray[np.float32]) -> None:
-        """Update the marks on the body, just before a picture.
-
-        Parameters
-        ----------
-        scene : that is drawn
-        vertices : (V, 3) array, of the pose drawn
-        """
-        self._mark_pins(scene)
-        self._mark_handles(scene, vertices)
-        line = None
+    def mark(self, vertices: npt.NDArray[np.float32]) -> None:
+        """Update the marks on the body, just before a picture of (V, 3) vertices."""
+        marks, model, line = self._scene.marks, self._document.model, None
+        self._mark_pins()
+        self._mark_handles(vertices)
         if self._grip is not None and self._target is not None:
-            up = self._up
+            up = np.array(model.up)
             below = self._target + ((vertices @ up).min() - self._target @ up) * up
             line = np.stack([self._grip.position(vertices), self._target, below])
-        scene.marks.show_target(line)
-        origin = None if self.arrows is None else self._home(self.arrows, vertices)
-        scene.marks.show_arrows(origin, self._axes)
-
-    @property
-    def _up(self) -> FloatArray:
-        up: FloatArray = np.eye(3)[self._document.model.up_axis]
-        return up
+        marks.show_target(line)
+        home = None
+        if self.arrows is not None:
+            home = self._document.motion.grip_at(self.arrows).position(vertices)
+        marks.show_arrows(home, self._axes)
 
     @property
     def _axes(self) -> FloatArray:
         """The body's left, front and up, as rows."""
-        up, front = self._up, self._document.model.front
+        up, front = self._document.model.up, self._document.model.front
         return np.stack([np.cross(up, front), front, up])
 
-    def _home(self, vertex: int, vertices: npt.NDArray[np.floating]) -> FloatArray:
-        return self._document.motion.grip_at(vertex).position(vertices)
-
-    def _mark_pins(self, scene: Scene) -> None:
+    def _mark_pins(self) -> None:
         document, pins = self._document, self._document.history.pose.pins
         colours = document.model.card.domain_colours
-        scene.marks.show_pins(
+        self._scene.marks.show_pins(
             np.array([pin.position for pin in pins]).reshape(-1, 3),
             [colours[domain_of(document.model, pin.vertex)] for pin in pins],
         )
 
-    def _mark_handles(self, scene: Scene, vertices: npt.NDArray[np.float32]) -> None:
+    def _mark_handles(self, vertices: npt.NDArray[np.float32]) -> None:
         """Show the handles of the body parts that are too small on the screen to grab."""
-        model, view = self._document.model, scene.view
+        model, view = self._document.model, self._scene.view
         places: list[FloatArray] = []
         whole = sum(handle.area for handle in self._handles)
         for handle in self._handles:
@@ -626,11 +611,15 @@ class Mouse(QObject):
             if handle.is_shown:
                 places.append(place)
         visible_domains = [handle.domain for handle in self._handles if handle.is_shown]
-        scene.marks.show_handles(
+        self._scene.marks.show_handles(
             np.array(places).reshape(-1, 3),
             [model.card.domain_colours[domain] for domain in visible_domains],
             visible_domains.index(self.handle) if self.handle in visible_domains else None,
         )
+
+    @property
+    def _scene(self) -> Scene:
+        return self._scene_now()
 
     @property
     def _size(self) -> Pixel:
@@ -639,14 +628,11 @@ class Mouse(QObject):
     @Slot()
     def _show_patch(self) -> None:
         """Paint the patch under the pointer, or the dragged one."""
-        scene = self._scene()
-        if scene is None:
-            return
         grip = self._grip
         if grip is None and self.vertex is not None and not self._canvas.is_dragging:
             grip = self._document.motion.grip_at(self.vertex)
         # A handle moves its whole body part, so it has no patch.
-        if scene.show_grip(grip if self.handle is None else None):
+        if self._scene.show_grip(grip if self.handle is None else None):
             self.redraw_wanted.emit()
 
     @Slot(object)
@@ -675,37 +661,34 @@ class Mouse(QObject):
     def _on_drag_began(
         self, start: QPointF, button: Qt.MouseButton, keys: Qt.KeyboardModifier
     ) -> None:
-        scene = self._scene()
-        if scene is None:
-            return
+        scene, self._place, self._drag = self._scene, start, self._turn
         modifier = Qt.KeyboardModifier
         whole_body = bool(keys & modifier.ControlModifier and keys & modifier.ShiftModifier)
         left = button is Qt.MouseButton.LeftButton
         axis = scene.marks.arrow_at(_pixel(start), scene.view, self._size) if left else None
         if button is Qt.MouseButton.RightButton:
-            self._drag = self._zooming(start)
+            self._drag = partial(self._zoom_by_drag, start)
         elif axis is not None and self.arrows is not None:
-            self._drag = self._moving_along(scene, start, self.arrows, self._axes[axis])
+            self._drag = self._moving_along(start, self.arrows, self._axes[axis])
         elif keys & modifier.ShiftModifier and not whole_body:
-            self._drag = self._shifting(start)
+            self._drag = self._shift
         elif left and not keys & modifier.AltModifier:
             self.point_at(start)
-            if self.vertex is None:
-                self._drag = self._turning(start)
-            elif keys & modifier.ControlModifier and not whole_body and self.pin is None:
-                self._drag = self._twisting(scene, start, self.vertex)
-            else:
-                self._drag = self._moving(scene, start, self.vertex, whole_body)
-        else:
-            self._drag = self._turning(start)
+            if self.vertex is not None:
+                twists = keys & modifier.ControlModifier and not whole_body and self.pin is None
+                if twists:
+                    self._drag = self._twisting(start, self.vertex)
+                else:
+                    self._drag = self._moving(start, self.vertex, whole_body)
         # Hide a patch that is not dragged: it would cover what the user looks at.
         self._show_patch()
         self.pointed.emit(None)
 
     @Slot(QPointF)
     def _on_dragged(self, place: QPointF) -> None:
+        before, self._place = self._place, place
         if self._drag is not None:
-            self._drag(place)
+            self._drag(before, place)
         if self.whole_body_drag and self._document.motion.dragging:
             self.whole_body_dragged.emit(place)
 
@@ -713,16 +696,16 @@ class Mouse(QObject):
     def _on_drag_ended(self, escaped: bool) -> None:
         self._forget_drag()
         self.hinted.emit("")
-        if self._document.motion.dragging:
-            if escaped:
-                self._document.motion.cancel_drag()
-            else:
-                self._document.motion.end_drag()
+        if escaped:
+            self._document.motion.cancel_drag()
+        else:
+            self._document.motion.end_drag()
         self.redraw_wanted.emit()
 
-    def _moving(self, scene: Scene, start: QPointF, vertex: int, whole_body: bool) -> _Drag:
+    def _moving(self, start: QPointF, vertex: int, whole_body: bool) -> _Drag:
         """Drag a patch, or the pin under the pointer, in a plane or over the body."""
-        document, vertices = self._document, np.asarray(scene.surface.vertices)
+        document, scene = self._document, self._scene
+        vertices = np.asarray(scene.surface.vertices)
         grip = document.motion.grip_at(vertex)
         if self.handle is not None:
             (grip,) = (handle.grip for handle in self._handles if handle.domain == self.handle)
@@ -753,24 +736,22 @@ class Mouse(QObject):
             body_size,
         )
         offset = home - drag_target.target(_pixel(start))
-        places = [start]
 
-        def move(place: QPointF) -> None:
-            places[0] = place
+        def move(_: QPointF, place: QPointF) -> None:
             self._aim(lambda: drag_target.target(_pixel(place)) + offset)
 
         def deepen(notches: float) -> None:
-            drag_target.shift(_pixel(places[0]), notches * _DEPTH_PER_NOTCH * body_size)
-            move(places[0])
+            drag_target.shift(_pixel(self._place), notches * _DEPTH_PER_NOTCH * body_size)
+            move(self._place, self._place)
 
         self._deepen = deepen
         return move
 
-    def _moving_along(self, scene: Scene, start: QPointF, vertex: int, axis: FloatArray) -> _Drag:
+    def _moving_along(self, start: QPointF, vertex: int, axis: FloatArray) -> _Drag:
         """Drag the patch of a vertex, with its pin if it has one, along an axis."""
-        document, view = self._document, scene.view
+        document, view = self._document, self._scene.view
         grip = self._grip = document.motion.grip_at(vertex)
-        home = grip.position(np.asarray(scene.surface.vertices))
+        home = grip.position(np.asarray(self._scene.surface.vertices))
         pinned = [
             index for index, pin in enumerate(document.history.pose.pins) if pin.vertex == vertex
         ]
@@ -781,7 +762,7 @@ class Mouse(QObject):
         self._canvas.setCursor(Qt.CursorShape.ClosedHandCursor)
         begun = along_axis(view, _pixel(start), self._size, home, axis)
 
-        def move(place: QPointF) -> None:
+        def move(_: QPointF, place: QPointF) -> None:
             way = along_axis(view, _pixel(place), self._size, home, axis) - begun
             self._aim(lambda: home + way * axis)
 
@@ -797,18 +778,18 @@ class Mouse(QObject):
         self._document.motion.drag_to(self._target)
         self.redraw_wanted.emit()
 
-    def _twisting(self, scene: Scene, start: QPointF, vertex: int) -> _Drag:
+    def _twisting(self, start: QPointF, vertex: int) -> _Drag:
         """Twist a body part about its long axis by pointer motion across the axis."""
         from lcollision_core.posing import Twist, long_axis
 
         document, domain = self._document, domain_of(self._document.model, vertex)
-        self._grip = None
+        scene, self._grip = self._scene, None
         inside = np.asarray(scene.surface.vertices)[document.model.space.vertex_domain == domain]
         direction = turn_about(long_axis(inside.astype(np.float64)), scene.view)
         document.motion.begin_drag(Twist(domain), f"Twist {part_name(document.model, vertex)}")
         self._canvas.setCursor(Qt.CursorShape.SizeHorCursor)
 
-        def twist(place: QPointF) -> None:
+        def twist(_: QPointF, place: QPointF) -> None:
             way = place - start
             along = way.x() * direction[0] + way.y() * direction[1]
             document.motion.drag_to(np.array([_TWIST_PER_PIXEL * along]))
@@ -817,37 +798,20 @@ class Mouse(QObject):
 
     # The camera.
 
-    def _turning(self, start: QPointF) -> _Drag:
-        def turn(last: QPointF, place: QPointF) -> None:
-            # Turn the current view: the camera may follow the body meanwhile.
-            way = (place - last) * _DEGREES_PER_PIXEL
-            self.camera_moved.emit(turned(self._view, way.x(), way.y()))
+    def _turn(self, before: QPointF, place: QPointF) -> None:
+        # Turn the current view: the camera may follow the body meanwhile.
+        way = (place - before) * _DEGREES_PER_PIXEL
+        self.camera_moved.emit(turned(self._scene.view, way.x(), way.y()))
 
-        return _by_steps(start, turn)
+    def _shift(self, before: QPointF, place: QPointF) -> None:
+        view = self._scene.view
+        self.camera_moved.emit(shifted(view, _pixel(before), _pixel(place), self._size))
 
-    def _shifting(self, start: QPointF) -> _Drag:
-        def shift(last: QPointF, place: QPointF) -> None:
-            moved = shifted(self._view, _pixel(last), _pixel(place), self._size)
-            self.camera_moved.emit(moved)
-
-        return _by_steps(start, shift)
-
-    def _zooming(self, start: QPointF) -> _Drag:
-        def zoom(last: QPointF, place: QPointF) -> None:
-            self._zoom(start, _ZOOM_PER_PIXEL ** (place.y() - last.y()))
-
-        return _by_steps(start, zoom)
-
-    @property
-    def _view(self) -> View:
-        scene = self._scene()
-        assert scene is not None
-        return scene.view
+    def _zoom_by_drag(self, start: QPointF, before: QPointF, place: QPointF) -> None:
+        self._zoom(start, _ZOOM_PER_PIXEL ** (place.y() - before.y()))
 
     def _zoom(self, place: QPointF, factor: float) -> None:
-        scene = self._scene()
-        if scene is None:
-            return
+        scene = self._scene
         view, now = scene.view, time.monotonic()
         anchor = self._zoom_anchor
         if anchor is None or anchor[0] != place or now - anchor[2] > _ZOOM_SECONDS:
@@ -859,18 +823,6 @@ class Mouse(QObject):
         self._zoom_anchor = (place, point, now)
         vertices, body_size = scene.surface.vertices, self._document.model.body_size
         self.camera_moved.emit(zoomed(view, point, factor, vertices, body_size))
-
-
-def _by_steps(start: QPointF, step: Callable[[QPointF, QPointF], None]) -> _Drag:
-    """Return a drag that calls `step` with the pointer's previous and present position."""
-    last = start
-
-    def move(place: QPointF) -> None:
-        nonlocal last
-        before, last = last, place
-        step(before, place)
-
-    return move
 
 
 def _pixel(place: QPointF) -> Pixel:

@@ -74,7 +74,7 @@ class Scene:
         self.selection = FaceHighlight(self.surface, model.faces, NAMED_FACE, 3)
         self._highlights = (self.uncounted, self.crossing, self.selection)
 
-        up = np.eye(3)[model.up_axis]
+        up = np.array(model.up)
         # Several bodies stand beside each other: their floor is as wide as they are.
         extents = np.ptp(model.without_ground(model.reference), axis=0)
         radius = _FLOOR_RADIUS * max(model.body_size, *np.delete(extents, model.up_axis))

@@ -25,7 +25,7 @@ from app.view.camera import (
     reframed_if_out_of_view,
 )
 from app.view.legend import DomainTag, LegendStrip
-from app.view.pictures import Pictures
+from app.view.offscreen import Pictures
 from app.view.shading import Known, Legend, Shader, Shading
 from app.view.theme import NORMAL, Ring, current_theme
 from app.work.frames import PoseFrame
@@ -450,7 +450,7 @@ class Viewport(QWidget):
             self.canvas = Canvas(self._bring_up_to_date, self)
             self.canvas.painted.connect(self.painted)
             self.canvas.menu_wanted.connect(self._on_menu_wanted)
-            self.mouse = Mouse(self._document, self.canvas, lambda: self.scene)
+            self.mouse = Mouse(self._document, self.canvas, self._present_scene)
             self.mouse.pointed.connect(self._on_pointed)
             self.mouse.whole_body_dragged.connect(self._show_tag)
             self.mouse.hinted.connect(self.hinted)
@@ -545,6 +545,10 @@ class Viewport(QWidget):
 
     # Drawing.
 
+    def _present_scene(self) -> Scene:
+        assert self.scene is not None
+        return self.scene
+
     def _recolour(self, crossing: bool = False) -> None:
         self._colours_stale = True
         self._crossing_stale = self._crossing_stale or crossing
@@ -576,7 +580,7 @@ class Viewport(QWidget):
             if exact is None or not exact.counted_only:
                 scene.uncounted.show(None if exact is None else exact.excluded_pairs)
         if self.mouse is not None:
-            self.mouse.mark(scene, frame.vertices)
+            self.mouse.mark(frame.vertices)
         scene.marks.show_contacts(frame.contacts)
         scene.marks.show_standing(frame.standing)
         scene.fit_to_screen(self.devicePixelRatioF())
