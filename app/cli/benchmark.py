@@ -19,7 +19,7 @@ from app.cli.console import (
 )
 from app.cli.contacts import note_rules
 from app.cli.models import measured_model, measured_model_sentence
-from app.cli.shared_options import ClearanceOption, ThreadsOption
+from app.cli.options import ClearanceOption, ThreadsOption
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
 

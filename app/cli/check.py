@@ -16,8 +16,7 @@ from app.cli.console import (
     progress_bar,
     tell,
 )
-from app.cli.options import refuse_given, takes_options
-from app.cli.shared_options import (
+from app.cli.options import (
     ClearanceOption,
     DeviceOption,
     ErrorBoundOption,
@@ -26,6 +25,8 @@ from app.cli.shared_options import (
     NoRulesOption,
     RestOption,
     TouchOption,
+    refuse_given,
+    takes_options,
     touch_entries,
 )
 from lcollision_core.devices import Device, choose_device

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import JsonOption, note, print_json, progress_bar, tell
-from app.cli.options import takes_options
-from app.cli.shared_options import ModelArgument
+from app.cli.options import ModelArgument, takes_options
 from lcollision_core.options import RuleOptions
 from lcollision_core.tasks.words import counted, say_number
 

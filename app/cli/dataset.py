@@ -9,8 +9,7 @@ import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.contacts import rules_sentence
-from app.cli.options import refuse_given, takes_options
-from app.cli.shared_options import Axis, PoseSetArgument
+from app.cli.options import Axis, PoseSetArgument, refuse_given, takes_options
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options import NO_CHANGE, RuleOptions
 from lcollision_core.tasks.words import counted, up_text

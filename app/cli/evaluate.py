@@ -11,7 +11,7 @@ import typer
 
 from app.cli.console import JsonOption, cancellable_bar, note, print_json, tell
 from app.cli.models import measured_model, measured_model_sentence
-from app.cli.shared_options import DeviceOption, ModelArgument, RowsOption
+from app.cli.options import DeviceOption, ModelArgument, RowsOption
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError
 from lcollision_core.tasks.words import counted, scores_text

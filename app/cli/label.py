@@ -23,7 +23,7 @@ from app.cli.console import (
 from app.cli.contacts import excluded_at_rest, note_rules
 from app.cli.evaluate import open_store
 from app.cli.models import measured_model, measured_model_sentence
-from app.cli.shared_options import DeviceOption, ModelArgument, ThreadsOption
+from app.cli.options import DeviceOption, ModelArgument, ThreadsOption
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError, listed
 from lcollision_core.options import SampleDistribution

@@ -10,7 +10,7 @@ import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, tell
 from app.cli.contacts import rules_json, rules_sentence
-from app.cli.shared_options import Axis, ModelArgument
+from app.cli.options import Axis, ModelArgument
 from lcollision_core.errors import LCollisionError
 from lcollision_core.tasks.words import counted, duration_text, scores_text
 

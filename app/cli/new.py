@@ -10,8 +10,7 @@ from app.cli.console import JsonOption, cancel_on_interrupt, note, print_json, s
 from app.cli.contacts import note_rules
 from app.cli.evaluate import kind_lines
 from app.cli.models import note_if_hiding
-from app.cli.options import takes_options
-from app.cli.shared_options import DeviceOption, ModelOutput
+from app.cli.options import DeviceOption, ModelOutput, takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.options import LearningRequest

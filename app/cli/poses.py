@@ -17,8 +17,7 @@ from app.cli.console import (
     tell,
 )
 from app.cli.contacts import note_rules
-from app.cli.options import takes_options
-from app.cli.shared_options import (
+from app.cli.options import (
     ClearanceOption,
     DeviceOption,
     ErrorBoundOption,
@@ -30,6 +29,7 @@ from app.cli.shared_options import (
     PosesOutput,
     ScaleOption,
     TouchOption,
+    takes_options,
     touch_entries,
 )
 from lcollision_core.devices import Device, choose_device

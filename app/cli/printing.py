@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, cancellable_bar, print_json, tell
-from app.cli.options import takes_options
-from app.cli.shared_options import ModelArgument, ScaleOption
+from app.cli.options import ModelArgument, ScaleOption, takes_options
 from lcollision_core.errors import LCollisionError, listed
 from lcollision_core.options import NO_SCENE, PrintOptions, RuleOptions
 from lcollision_core.tasks.words import counted, printed_text

@@ -22,9 +22,9 @@ from app.cli.console import (
     tell,
 )
 from app.cli.contacts import excluded_at_rest, note_rules
-from app.cli.options import Excluding, refuse_given, takes_options
-from app.cli.shared_options import (
+from app.cli.options import (
     DeviceOption,
+    Excluding,
     FormOutput,
     InPlaceOption,
     JointsOption,
@@ -32,6 +32,8 @@ from app.cli.shared_options import (
     ScaleOption,
     ThreadsOption,
     TouchOption,
+    refuse_given,
+    takes_options,
     touch_entries,
 )
 from lcollision_core.devices import Device, choose_device

@@ -14,8 +14,14 @@ import typer
 from app.cli.console import cancel_on_interrupt, note, progress_bar, status_bar
 from app.cli.evaluate import StoreArgument, kind_lines, open_store
 from app.cli.models import describe, error_sentence, measured_model_sentence, note_where_written
-from app.cli.options import takes_options
-from app.cli.shared_options import Axis, ModelArgument, ModelOutput, PoseSetArgument, RowsOption
+from app.cli.options import (
+    Axis,
+    ModelArgument,
+    ModelOutput,
+    PoseSetArgument,
+    RowsOption,
+    takes_options,
+)
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import Job
 from lcollision_core.options import RuleOptions
