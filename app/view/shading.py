@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.bundled import bundled_table
+
 ColourArray = npt.NDArray[np.uint8]
 FloatArray = npt.NDArray[np.float64]
 
@@ -290,46 +292,4 @@ class Theme:
         return self.name == "dark"
 
 
-LIGHT = Theme(
-    name="light",
-    window="#eef0f3",
-    card="#ffffff",
-    field="#ffffff",
-    border="#d3d8df",
-    track="#dfe3e9",
-    text="#1b2027",
-    muted="#57616d",
-    accent="#2563c9",
-    on_accent="#ffffff",
-    free="#00735c",
-    colliding="#b93a0b",
-    waiting="#57616d",
-    sky_bottom="#e4e8ed",
-    sky_top="#fafbfc",
-    floor="#d3d9e1",
-    shadow="#c2c9d3",
-    skin="#e9e5df",
-    ghost="#6b7c93",
-)
-
-DARK = Theme(
-    name="dark",
-    window="#1d2025",
-    card="#262a31",
-    field="#1f2329",
-    border="#3a4049",
-    track="#3b424c",
-    text="#e6e9ee",
-    muted="#a0a9b5",
-    accent="#6ba4ff",
-    on_accent="#0b1526",
-    free="#4fd1ae",
-    colliding="#ff9468",
-    waiting="#a0a9b5",
-    sky_bottom="#191c21",
-    sky_top="#343a44",
-    floor="#2a2f37",
-    shadow="#1d2127",
-    skin="#d3d1ce",
-    ghost="#c3d2e6",
-)
+LIGHT, DARK = bundled_table("themes.toml", dict[str, list[Theme]])["theme"]
