@@ -220,36 +220,33 @@ class FileActions(QObject):
                 f"Couldn't open {path}: there is no such file",
                 "choose a file of poses, a character, a mesh or a model",
             )
-        document, meshes = self._document, (*READABLE_SUFFIXES, *CHARACTER_SUFFIXES)
-        openers: dict[str, Callable[[Path], None]] = {
-            POSES_SUFFIX: document.tasks.open_poses,
-            MODEL_SUFFIX: document.tasks.open_model,
-        }
+        tasks, meshes = self._document.tasks, (*READABLE_SUFFIXES, *CHARACTER_SUFFIXES)
         if suffix in SKELETON_SUFFIXES or is_smpl_motion(path) or is_generated(path):
             self.open_motion(path)
-            return
-        if suffix in CHARACTER_SUFFIXES or (beside is not None and suffix in READABLE_SUFFIXES):
-            opened = partial(self._open_examined, path, beside)
-            document.tasks.examine(path, opened, beside=beside)
-            return
-        if suffix not in (*openers, *meshes):
+        elif suffix in CHARACTER_SUFFIXES or (beside is not None and suffix in READABLE_SUFFIXES):
+            tasks.examine(path, partial(self._open_examined, path, beside), beside=beside)
+        elif suffix in READABLE_SUFFIXES:
+            # No question about changes: the import can be undone.
+            self._import_mesh(path, body_is_chosen)
+        elif suffix == MODEL_SUFFIX:
+            if self.confirm_losing_changes():
+                tasks.open_model(path)
+                self._remember_folder(path)
+        elif is_scene_file(path):
+            if self.confirm_losing_changes():
+                tasks.open_model(path)
+        elif suffix == POSES_SUFFIX:
+            if self.confirm_losing_changes(with_library=False):
+                self._require_model(path)
+                tasks.open_poses(path)
+                self._remember_folder(path)
+        else:
             raise LCollisionError(
                 f"isn't supported ({path.name})",
                 f"open poses ({POSES_SUFFIX}), a character or a mesh "
                 f"({', '.join(dict.fromkeys(meshes))}) or a model ({MODEL_SUFFIX})",
                 where=_kind(path),
             )
-        if suffix in meshes:
-            # No question about changes: the import can be undone.
-            self._import_mesh(path, body_is_chosen)
-        elif is_scene_file(path):
-            if self.confirm_losing_changes():
-                document.tasks.open_model(path)
-        elif self.confirm_losing_changes(with_library=suffix == MODEL_SUFFIX):
-            if suffix == POSES_SUFFIX:
-                self._require_model(path)
-            openers[suffix](path)
-            self._remember_folder(path)
 
     def _require_model(self, path: Path) -> None:
         if not self._document.has_model:

@@ -81,10 +81,11 @@ class LearningActions(QObject):
         self.runs.changed.connect(self._on_runs)
         files.learning_wanted.connect(self.new_model)
         document.tasks.opened.connect(self._on_opened)
-        document.model_changed.connect(self._on_model)
-        self._began = False
         if document.has_model:
-            self._on_model()
+            self._look_for_runs()
+        else:
+            once = Qt.ConnectionType.SingleShotConnection
+            document.model_changed.connect(self._look_for_runs, once)
 
     @Slot(object)
     def new_model(self, paths: Sequence[Path] = ()) -> None:
@@ -163,12 +164,10 @@ class LearningActions(QObject):
             self.runs.poll()
 
     @Slot()
-    def _on_model(self) -> None:
-        if not self._began:
-            self._began = True
-            # Load in a worker: the imports take longer than a frame.
-            work = learning_runs.load_learning
-            self._work.start("Looking for runs", work, lambda _: self.runs.start_polling())
+    def _look_for_runs(self) -> None:
+        # Load in a worker: the imports take longer than a frame.
+        work = learning_runs.load_learning
+        self._work.start("Looking for runs", work, lambda _: self.runs.start_polling())
 
     @Slot()
     def _on_runs(self) -> None:

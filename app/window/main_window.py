@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from app.editing.document import PoseDocument
-    from app.editing.recovery import Autosave, RecoverablePose
+    from app.editing.recovery import Autosave
     from lcollision_core.meshes import Topology
 
 _log = logging.getLogger(__name__)
@@ -72,8 +72,8 @@ class MainWindow(EditorWindow):
         self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         self.document = document
         self.settings = settings
-        self._autosave: Autosave | None = None
-        self._announced = self._unasked = False
+        self.autosave: Autosave | None = None
+        self._unasked = False
         self.setObjectName("editor")
         self.setWindowIcon(program_icon())
         FileDrops(self).dropped.connect(self._on_dropped)
@@ -122,18 +122,6 @@ class MainWindow(EditorWindow):
         self.timeline.follow_motion()
         self._on_model()
 
-    # Public operations.
-
-    def set_autosave(self, autosave: Autosave) -> None:
-        """Take over an autosave: show its failures, and close it with the window."""
-        self._autosave = autosave
-        autosave.failed.connect(self.show_failure)
-
-    def recover(self, lost: RecoverablePose) -> None:
-        """Continue with a pose recovered after a crash."""
-        if self._autosave is not None:
-            self._autosave.recover(lost)
-
     # Overridden from Qt.
 
     def showEvent(self, event: QShowEvent) -> None:  # noqa: N802 - Qt's name
@@ -179,8 +167,8 @@ class MainWindow(EditorWindow):
         for widget in (self, *self.findChildren(QWidget)):
             if widget.isWindow():
                 widget.hide()
-        if self._autosave is not None:
-            self._autosave.close(keep=self._unasked)
+        if self.autosave is not None:
+            self.autosave.close(keep=self._unasked)
         if not self.document.close():
             _log.warning("a thread was still busy when the window closed")
         self._status.clearMessage()
@@ -279,9 +267,9 @@ class MainWindow(EditorWindow):
 
     @Slot()
     def _on_frame(self) -> None:
-        if self._announced or self.document.motion.frame is None:
+        if self.document.motion.frame is None:
             return
-        self._announced = True
+        self.document.motion.frame_changed.disconnect(self._on_frame)
         self.ready.emit()
         # Draw the thumbnails only once the pose itself has been drawn.
         QTimer.singleShot(300, self.library, self.library.allow_pictures)

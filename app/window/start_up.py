@@ -89,8 +89,8 @@ class StartUp(QObject):
     def _on_model(self) -> None:
         from app.editing.recovery import Autosave
 
-        autosave = Autosave(self._document)
-        self._window.set_autosave(autosave)
+        autosave = self._window.autosave = Autosave(self._document)
+        autosave.failed.connect(self._window.show_failure)
         # Wait until the document has loaded its own pose.
         QTimer.singleShot(0, self, self._on_first_pose)
         # Frame the first pose only: later ones keep the user's camera.
@@ -122,7 +122,8 @@ class StartUp(QObject):
         for pose in lost:
             answer = ask_about_recovery(self._window, pose)
             if answer is Choice.SAVE:
-                self._window.recover(pose)
+                assert self._window.autosave is not None
+                self._window.autosave.recover(pose)
                 break
             if answer is Choice.DISCARD:
                 pose.session.discard()

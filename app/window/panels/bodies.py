@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -197,26 +197,23 @@ class BodiesPanel(QWidget):
             hidden[scene.faces_of[name]] = True
         return hidden
 
-    def _lock(self, domains: frozenset[int], *, locked: bool) -> None:
-        for domain in sorted(domains):
-            self._document.motion.set_locked(domain, locked)
-
     @Slot(QTreeWidgetItem, int)
     def _on_changed(self, row: QTreeWidgetItem, column: int) -> None:
         scene = self.scene
         if scene is None or column == _NAME:
             return
         name, is_on = row.text(_NAME), row.checkState(column) is Qt.CheckState.Checked
-        change: dict[int, Callable[[], None]] = {
-            _SEEN: lambda: self._show(name, shown=is_on),
-            _LOCKED: lambda: self._lock(frozenset(scene.domains_of_member(name)), locked=is_on),
-            _COUNTED: lambda: self._count(scene, name, counted=is_on),
-        }
-        change[column]()
+        if column == _SEEN:
+            (self._hidden.discard if is_on else self._hidden.add)(name)
+            self.hidden_changed.emit(self.hidden_faces)
+        elif column == _LOCKED:
+            self._lock(scene.domains_of_member(name), locked=is_on)
+        else:
+            self._count(scene, name, counted=is_on)
 
-    def _show(self, name: str, *, shown: bool) -> None:
-        (self._hidden.discard if shown else self._hidden.add)(name)
-        self.hidden_changed.emit(self.hidden_faces)
+    def _lock(self, domains: Iterable[int], *, locked: bool) -> None:
+        for domain in sorted(domains):
+            self._document.motion.set_locked(domain, locked)
 
     def _count(self, scene: SceneBody, name: str, *, counted: bool) -> None:
         others = [one for one in scene.rules.left_out if one != name]

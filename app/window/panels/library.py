@@ -71,16 +71,11 @@ _LINES = 2
 class PoseGrid(QListWidget):
     """Thumbnails of poses with their names beneath, from left to right in rows.
 
-    Signals
-    -------
-    thumbnail_requested : int, a visible row that has no thumbnail yet
-
     Attributes
     ----------
+    delegate : requests thumbnails
     hint : text shown if there are no poses
     """
-
-    thumbnail_requested = Signal(int)
 
     def __init__(self) -> None:
         super().__init__()
@@ -95,9 +90,8 @@ class PoseGrid(QListWidget):
         self.setGridSize(self._cell)
         self.setUniformItemSizes(True)
         self.setWordWrap(True)
-        delegate = _CellDelegate(self._cell, self)
-        delegate.thumbnail_requested.connect(self.thumbnail_requested)
-        self.setItemDelegate(delegate)
+        self.delegate = _CellDelegate(self._cell, self)
+        self.setItemDelegate(self.delegate)
         self.setVerticalScrollMode(QListWidget.ScrollMode.ScrollPerPixel)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.setContextMenuPolicy(Qt.ContextMenuPolicy.CustomContextMenu)
@@ -249,7 +243,7 @@ class LibraryPanel(QWidget):
         self.list.itemSelectionChanged.connect(self._on_chosen)
         self.list.currentRowChanged.connect(self._on_chosen)
         self.list.customContextMenuRequested.connect(self._on_menu)
-        self.list.thumbnail_requested.connect(self._on_thumbnail_requested)
+        self.list.delegate.thumbnail_requested.connect(self._on_thumbnail_requested)
         self.blend.sliderPressed.connect(self._on_blend_pressed)
         self.blend.valueChanged.connect(self._on_blend)
         self.blend.sliderReleased.connect(self._on_blend_released)
