@@ -138,6 +138,7 @@ class PoseMotion(QObject):
     clearance : kept between parts by Resolve and Solid, normalised
     drag_strength : how strongly drags stay near the training poses; 0 not at all
     locked_domains : not changed by drags, Resolve, Randomise, Reset all and blending
+    predicts : frames come with a prediction
 
     Signals
     -------
@@ -169,7 +170,7 @@ class PoseMotion(QObject):
         self.solid, self.standing, self.whole_body = True, True, False
         self.drag_strength, self.clearance = 1.0, 0.0
         self.locked_domains: frozenset[int] = frozenset()
-        self._is_ready = self._predicts = self._is_quick = self._has_skipped = False
+        self._is_ready = self.predicts = self._is_quick = self._has_skipped = False
         self._adopted: FloatArray | None = None
         self._moving: ActiveMotion | None = None
         self._grip_radius: float | None = None
@@ -190,17 +191,12 @@ class PoseMotion(QObject):
         self.frame = self._last_grip = None
         self._grips = {}
         self._set_exact(None)
-        self._is_ready = self._predicts = False
+        self._is_ready = self.predicts = False
         self.follow()
-
-    @property
-    def predicts(self) -> bool:
-        """Whether frames come with a prediction."""
-        return self._predicts
 
     def set_ready(self, predicts: bool) -> None:
         """Start measuring frames, and predicting if `predicts`: all is loaded and compiled."""
-        self._is_ready, self._predicts = True, predicts
+        self._is_ready, self.predicts = True, predicts
         if predicts and self._moving is None and not self.shows_another:
             self.follow()
         else:
@@ -554,13 +550,13 @@ class PoseMotion(QObject):
         assert gesture is not None
         gesture.has_asked = True
         moving.target, moving.least_miss, moving.n_idle = read_only(target), np.inf, 0
-        self._mailbox.put(PoseRequest(self._history.model, target, moving.start, self._predicts))
+        self._mailbox.put(PoseRequest(self._history.model, target, moving.start, self.predicts))
 
     def follow(self) -> None:
         """Request the frame, and later the exact check, of the present pose."""
         self._moving = self.resting = None
         self.shows_another = False
-        history, predicts = self._history, self._predicts
+        history, predicts = self._history, self.predicts
         space = history.state.space
         self._mailbox.put(PoseRequest(history.model, history.latent, None, predicts, space))
 
@@ -588,7 +584,7 @@ class PoseMotion(QObject):
         # The motion's first request may have replaced the one for this pose, and the predictor
         # may have become ready during the drag.
         is_of_pose = frame is not None and frame.latent is self._history.latent
-        lacks = frame is None or (self._predicts and frame.prediction is None)
+        lacks = frame is None or (self.predicts and frame.prediction is None)
         if not self.shows_another and (lacks or not is_of_pose):
             self.follow()
         elif self.resting is not None:

@@ -78,16 +78,11 @@ class MotionResolve(QObject):
         tasks.busy_changed.connect(self._on_busy)
 
     @property
-    def runs(self) -> bool:
-        """Whether a Resolve of a motion runs."""
-        return self._tasks.solving_motion
-
-    @property
     def spans(self) -> tuple[range, ...]:
         """The spans of frames that the running Resolve has freed so far."""
         from lcollision_core.motion.motion import runs
 
-        return tuple(runs(self._solved)) if self.runs else ()
+        return tuple(runs(self._solved)) if self._tasks.solving_motion else ()
 
     def start(
         self,
@@ -112,7 +107,7 @@ class MotionResolve(QObject):
 
     def end(self, why: str) -> None:
         """Cancel the Resolve, with `why` as the message."""
-        if self.runs:
+        if self._tasks.solving_motion:
             self._tasks.cancel(Work.RESOLVE_MOTION)
             self._tasks.message.emit(why)
 
@@ -152,6 +147,6 @@ class MotionResolve(QObject):
 
     @Slot()
     def _on_busy(self) -> None:
-        if self.progress is not None and not self.runs:
+        if self.progress is not None and not self._tasks.solving_motion:
             self.progress = None
             self.changed.emit()

@@ -495,8 +495,9 @@ class Timeline(QObject):
         numbers = [frame, *self.onion.frames(frame, len(motion))]
         numbers += [self._wrapped(frame + by) for by in range(1, ahead + 1)]
         requests = [(motion, number) for number in dict.fromkeys(numbers)]
-        if self._has_ghost(motion, frame) and self.original is not None:
-            requests.insert(1, (self.original, frame))
+        before = self._differing(motion, frame)
+        if before is not None:
+            requests.insert(1, (before, frame))
         self._cache.want(requests)
 
     def _wrapped(self, frame: int) -> int:
@@ -522,19 +523,16 @@ class Timeline(QObject):
 
     # The motion as read.
 
-    def _has_ghost(self, motion: Motion, frame: int) -> bool:
+    def _differing(self, motion: Motion, frame: int) -> Motion | None:
+        """Return the motion as it was read if its frame differs and is shown as a ghost."""
         before = self.original
-        return (
-            before is not None
-            and motion is not before
-            and self._history.ghost_shown
-            and not np.array_equal(before.codes[frame], motion.codes[frame])
-        )
+        if before is None or motion is before or not self._history.ghost_shown:
+            return None
+        return None if np.array_equal(before.codes[frame], motion.codes[frame]) else before
 
     def _ghost(self, motion: Motion, frame: int) -> npt.NDArray[np.float32] | None:
-        if self.original is None or not self._has_ghost(motion, frame):
-            return None
-        cached = self._cache.get(self.original, frame)
+        before = self._differing(motion, frame)
+        cached = None if before is None else self._cache.get(before, frame)
         return None if cached is None else cached.vertices
 
     def compare(self, comparing: bool) -> None:

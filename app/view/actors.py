@@ -79,10 +79,10 @@ def make_actor(polydata: pv.PolyData, coloured: bool = False, **properties: Any)
     return actor
 
 
-def body_actor(polydata: pv.PolyData, coloured: bool = True, **properties: Any) -> pv.Actor:
+def body_actor(polydata: pv.PolyData, **properties: Any) -> pv.Actor:
     """Return an actor for a body: `make_actor` with a body's lighting."""
     shine = {"ambient": 0.22, "diffuse": 0.92, "specular": 0.1, "specular_power": 18}
-    return make_actor(polydata, coloured, **shine, **properties)
+    return make_actor(polydata, True, **shine, **properties)
 
 
 _ALONG = 0.85

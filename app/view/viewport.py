@@ -151,7 +151,6 @@ class Viewport(QWidget):
     Parameters
     ----------
     document : may have no model yet
-    parent : of the widget
 
     Attributes
     ----------
@@ -183,8 +182,8 @@ class Viewport(QWidget):
     painted = Signal(float)
     hinted = Signal(str)
 
-    def __init__(self, document: PoseDocument, parent: QWidget | None = None) -> None:
-        super().__init__(parent)
+    def __init__(self, document: PoseDocument) -> None:
+        super().__init__()
         self._document = document
         self.shading, self.follows = Shading.PLAIN, True
         self._moment: tuple[str, int] | None = None

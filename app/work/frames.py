@@ -111,7 +111,7 @@ class FrameEvaluator:
 
     def __init__(self, model: Body) -> None:
         self.model = model
-        self.predicts = True
+        self.predicts = False
         self._checks: deque[float] = deque(maxlen=_CHECKS)
 
     def frame(
@@ -290,7 +290,6 @@ class PoseWorker:
         evaluator, resting = self._evaluator, request.resting
         if evaluator is None or evaluator.model is not request.model:
             self._evaluator = evaluator = FrameEvaluator(request.model)
-            evaluator.predicts = False
             # The dragger belongs to the previous model.
             self._start = self._dragger = None
         if resting is not None:
@@ -322,6 +321,10 @@ class PoseMailbox(QObject):
     Signals
     -------
     answered : PoseRequest and its Response; see `PoseWorker.answer`
+
+    Attributes
+    ----------
+    waiting : the request that the worker gets next
     """
 
     answered = Signal(object, object)
@@ -334,39 +337,34 @@ class PoseMailbox(QObject):
         self._worker, self._thread = PoseWorker(), WorkerThread("pose")
         # Emitted in that thread, and received in the window's.
         self._responded.connect(self._on_answered)
-        self._waiting: PoseRequest | None = None
+        self.waiting: PoseRequest | None = None
         self._asked: PoseRequest | None = None
         self._is_due = False
         # Sooner than a timer of 0 ms, which Qt fires only after drawing the slider.
         self._due.connect(self.send, Qt.ConnectionType.QueuedConnection)
 
     @property
-    def waiting(self) -> PoseRequest | None:
-        """The request that the worker gets next."""
-        return self._waiting
-
-    @property
     def pending(self) -> list[PoseRequest]:
         """The unanswered requests: the one in progress, and the waiting one."""
-        return [request for request in (self._asked, self._waiting) if request is not None]
+        return [request for request in (self._asked, self.waiting) if request is not None]
 
     def put(self, request: PoseRequest) -> None:
         """Replace the waiting request, and send it soon."""
-        self._waiting = request
+        self.waiting = request
         if not self._is_due:
             self._is_due = True
             self._due.emit()
 
     def withdraw(self) -> None:
         """Drop the waiting request."""
-        self._waiting = None
+        self.waiting = None
 
     @Slot()
     def send(self) -> None:
         """Send the waiting request unless the worker is busy."""
         self._is_due = False
-        if self._asked is None and self._waiting is not None:
-            self._asked, self._waiting = self._waiting, None
+        if self._asked is None and self.waiting is not None:
+            self._asked, self.waiting = self.waiting, None
             self._thread.submit(self._answer, self._asked)
 
     def _answer(self, request: PoseRequest) -> None:
@@ -374,7 +372,7 @@ class PoseMailbox(QObject):
 
     def close(self, deadline: float) -> bool:
         """End the thread; see `LongWork.close`."""
-        self._waiting = self._asked = None
+        self.waiting = self._asked = None
         self.blockSignals(True)
         return self._thread.end(deadline)
 
@@ -497,17 +495,16 @@ class FrameCache(QObject):
                 self._wanted = []
             if model is not self._model:
                 return
-        if answer.failure is not None:
-            self.failed.emit(answer.failure)
-        if frame is None:
-            return
-        with self._guard:
-            self._frames[_key(motion, number)] = frame
-            self._n_bytes += _bytes_of(frame)
+            if frame is not None:
+                self._frames[_key(motion, number)] = frame
+                self._n_bytes += _bytes_of(frame)
             while self._n_bytes > MOST_BYTES and len(self._frames) > 1:
                 oldest = next(iter(self._frames))
                 self._n_bytes -= _bytes_of(self._frames.pop(oldest))
-        self.ready.emit(motion, number)
+        if answer.failure is not None:
+            self.failed.emit(answer.failure)
+        elif frame is not None:
+            self.ready.emit(motion, number)
 
     def close(self, deadline: float) -> bool:
         """End the thread; see `LongWork.close`."""

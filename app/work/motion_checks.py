@@ -58,15 +58,11 @@ class MotionChecks:
         """Return the checks that stay valid after an edit; `same` marks the (T,) equal frames."""
         # The pose between two frames depends on both.
         both = same & np.append(same[1:], True)
-        return MotionChecks(
-            np.where(same, self.deepest, np.nan),
-            np.where(same[:, None], self.parts, 0.0).astype(np.float32),
-            self.between & both,
-            self.checked_between & both,
-            np.where(same, self.estimate, np.nan),
-            np.where(same[:, None], self.excluded, 0),
-            np.where(same, self.excluded_deepest, 0.0),
-        )
+        valid = MotionChecks.of(*self.parts.shape)
+        for name, before in vars(self).items():
+            frames = both if name in ("between", "checked_between") else same
+            getattr(valid, name)[frames] = before[frames]
+        return valid
 
     @property
     def left_out(self) -> ExcludedPairs:

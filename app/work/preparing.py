@@ -75,7 +75,6 @@ def ready(opened: OpenedModel, job: Job) -> OpenedModel:
 def warm_up(body: Body, job: Job = UNWATCHED) -> None:
     """Compute once everything that the first frames need, except predictions."""
     evaluator = FrameEvaluator(body)
-    evaluator.predicts = False
     latent = np.zeros(body.latent_size)
     latent.flags.writeable = False
     frame = evaluator.frame(latent)

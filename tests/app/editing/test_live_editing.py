@@ -367,7 +367,7 @@ def test_a_predictor_that_comes_in_mid_drag_lets_it_go_on(
     qtbot: QtBot, solid: PoseDocument
 ) -> None:
     grip, model = end_of(solid), solid.model
-    solid.motion._predicts = False
+    solid.motion.predicts = False
     solid.motion._mailbox._worker._evaluator.predicts = False
     solid.motion.begin_drag(grip, "Drag")
     solid.motion.drag_to(moved(solid, grip, 0.05))
