@@ -24,6 +24,8 @@ class FaceTree(NamedTuple):
     left, right : (n,) int32, the children of a node, -1 at a leaf
     leaf : (n,) int32, the number of the leaf, -1 at an inner node
     size : (n,) int32, the number of faces below the node
+    start, vertex : (leaves + 1,) and (m,) int32; leaf i has the vertices
+        ``vertex[start[i]:start[i + 1]]``, each once
     """
 
     slot_face: IntArray
@@ -32,6 +34,8 @@ class FaceTree(NamedTuple):
     right: IntArray
     leaf: IntArray
     size: IntArray
+    start: IntArray
+    vertex: IntArray
 
 
 class Lists(NamedTuple):
@@ -134,9 +138,9 @@ class PoseWorkspace(NamedTuple):
     ----------
     middle : (3,) float64, the middle of the pose's bounding box, in the pose's unit
     vertices : (V, 3) float64, in normalised length about that middle
-    rounded : (V, 3) float32, the same
     pair : (2, 3, 3) float64, the corners of two triangles
     boxes : (6 S,) float32; for each leaf the lower x of its slots, lower y, lower z, upper x, ...
+    has_boxes : (leaves,) bool, whether these are filled in for a leaf
     node_boxes : (n, 6) float32, lower x, y, z, upper x, y, z
     stack : (depth bound, 2) int32, pairs of nodes still to be visited
     fraction : (depth bound,) float64, the estimated fraction of the search that each of these is
@@ -144,9 +148,9 @@ class PoseWorkspace(NamedTuple):
 
     middle: npt.NDArray[np.float64]
     vertices: npt.NDArray[np.float64]
-    rounded: npt.NDArray[np.float32]
     pair: npt.NDArray[np.float64]
     boxes: npt.NDArray[np.float32]
+    has_boxes: npt.NDArray[np.bool_]
     node_boxes: npt.NDArray[np.float32]
     stack: IntArray
     fraction: npt.NDArray[np.float64]

@@ -164,28 +164,39 @@ def fill_depths(triangles: FloatArray, tolerances: FloatArray, depths: FloatArra
         )
 
 
-@compiled_part
-def _load_vertices(pose, scale, work):
+@compiled
+def load_vertices(pose: FloatArray, scale: float, work: PoseWorkspace) -> bool:
     """Fill in the vertices of one pose and return True, or False if beyond `MAX_DISTANCE`.
 
     Coordinates are relative to the middle of the pose's bounding box, so that a pose far from the
     origin keeps its precision.
+
+    Parameters
+    ----------
+    pose : (V, 3) float64 array
+    scale : factor from the pose's unit to normalised length
+    work : overwritten
     """
-    middle, vertices, rounded = work.middle, work.vertices, work.rounded
-    for c in range(3):
-        low = np.inf
-        high = -np.inf
-        for v in range(len(pose)):
-            # Written so that NaN fails it.
-            if not abs(pose[v, c]) * scale <= MAX_DISTANCE:
-                return False
-            low = min(low, pose[v, c])
-            high = max(high, pose[v, c])
-        middle[c] = 0.5 * (low + high)
+    numbers = pose.reshape(-1)
+    n_beyond = np.int64(0)
+    for n in range(len(numbers)):
+        # Written so that NaN fails it.
+        n_beyond += np.int64(not abs(numbers[n]) * scale <= MAX_DISTANCE)
+    if n_beyond > 0:
+        return False
+    x0 = y0 = z0 = np.inf
+    x1 = y1 = z1 = -np.inf
     for v in range(len(pose)):
-        for c in range(3):
-            vertices[v, c] = (pose[v, c] - middle[c]) * scale
-            rounded[v, c] = np.float32(vertices[v, c])
+        x, y, z = pose[v, 0], pose[v, 1], pose[v, 2]
+        x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
+        x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
+    x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (z0 + z1)
+    middle, vertices = work.middle, work.vertices
+    middle[0], middle[1], middle[2] = x, y, z
+    for v in range(len(pose)):
+        vertices[v, 0] = (pose[v, 0] - x) * scale
+        vertices[v, 1] = (pose[v, 1] - y) * scale
+        vertices[v, 2] = (pose[v, 2] - z) * scale
     return True
 
 
@@ -201,66 +212,87 @@ def _are_one_point(vertices, a, b, c):
     )
 
 
+@inlined
+def _wider(lower, upper, enlarged):
+    """Return the ends of an interval in float32, moved outwards by half of `enlarged` if any."""
+    lower, upper = np.float32(lower), np.float32(upper)
+    if enlarged > 0.0 and lower <= upper:
+        # Rounding a place, and moving it, errs by 2^-24 of the numbers each.
+        half = np.float32(0.5 * enlarged)
+        half += (half + max(abs(lower), abs(upper))) * _OUTWARD
+        lower, upper = lower - half, upper + half
+    return lower, upper
+
+
 @compiled_part
-def _refit(pose, scale, tolerance, enlarged, end, tree, work):
-    """Fill `work` for one pose and return True, or False if it is not within `MAX_DISTANCE`.
+def _refit(scale, tolerance, enlarged, end, tree, work):
+    """Fill the boxes of the nodes for one pose whose vertices are loaded.
 
     Boxes of faces that are at most `enlarged` apart, in normalised length, overlap. If there is a
     pose `end`, boxes hold the linear path of their faces to it. With neither, faces that are one
     point have empty boxes: they penetrate nothing, and many at one place would make many pairs.
     """
-    if not _load_vertices(pose, scale, work):
-        return False
-    middle, vertices, rounded = work.middle, work.vertices, work.rounded
-    boxes, moves = work.boxes, len(end) > 0
-    for slot in range(len(tree.slot_face)):
-        leaf = slot // LEAF_SIZE
-        lane = slot % LEAF_SIZE
-        first = tree.corners[leaf * 3 * LEAF_SIZE + lane]
-        second = tree.corners[leaf * 3 * LEAF_SIZE + LEAF_SIZE + lane]
-        third = tree.corners[leaf * 3 * LEAF_SIZE + 2 * LEAF_SIZE + lane]
-        base = leaf * 6 * LEAF_SIZE + lane
-        is_left_out = first < 0
-        if not is_left_out and not moves and enlarged <= tolerance:
-            is_left_out = _are_one_point(vertices, first, second, third)
-        for c in range(3):
-            if is_left_out:
-                boxes[base + c * LEAF_SIZE] = np.inf
-                boxes[base + (3 + c) * LEAF_SIZE] = -np.inf
-                continue
-            p, q, r = rounded[first, c], rounded[second, c], rounded[third, c]
-            lower, upper = min(p, min(q, r)), max(p, max(q, r))
-            if moves:
-                for v in (first, second, third):
-                    place = np.float32((end[v, c] - middle[c]) * scale)
-                    lower, upper = min(lower, place), max(upper, place)
-            if enlarged > 0.0:
-                # Rounding a place, and moving it, errs by 2^-24 of the numbers each.
-                half = np.float32(0.5 * enlarged)
-                half += (half + max(abs(lower), abs(upper))) * _OUTWARD
-                lower, upper = lower - half, upper + half
-            boxes[base + c * LEAF_SIZE] = lower
-            boxes[base + (3 + c) * LEAF_SIZE] = upper
-
-    node_boxes = work.node_boxes
+    middle, vertices, node_boxes = work.middle, work.vertices, work.node_boxes
+    moves = len(end) > 0
+    work.has_boxes[:] = False
     for node in range(len(tree.left) - 1, -1, -1):
         if tree.leaf[node] >= 0:
-            base = tree.leaf[node] * 6 * LEAF_SIZE
-            for c in range(3):
-                lower = boxes[base + c * LEAF_SIZE]
-                upper = boxes[base + (3 + c) * LEAF_SIZE]
-                for k in range(1, LEAF_SIZE):
-                    lower = min(lower, boxes[base + c * LEAF_SIZE + k])
-                    upper = max(upper, boxes[base + (3 + c) * LEAF_SIZE + k])
-                node_boxes[node, c] = lower
-                node_boxes[node, 3 + c] = upper
+            leaf = tree.leaf[node]
+            x0 = y0 = z0 = np.inf
+            x1 = y1 = z1 = -np.inf
+            for k in range(np.uint64(tree.start[leaf]), np.uint64(tree.start[leaf + 1])):
+                v = np.uint64(tree.vertex[k])
+                x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
+                x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
+                x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
+                if moves:
+                    x = (end[v, 0] - middle[0]) * scale
+                    y = (end[v, 1] - middle[1]) * scale
+                    z = (end[v, 2] - middle[2]) * scale
+                    x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
+                    x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
+            if not moves and enlarged <= tolerance and x0 == x1 and y0 == y1 and z0 == z1:
+                x0 = y0 = z0 = np.inf
+                x1 = y1 = z1 = -np.inf
+            node_boxes[node, 0], node_boxes[node, 3] = _wider(x0, x1, enlarged)
+            node_boxes[node, 1], node_boxes[node, 4] = _wider(y0, y1, enlarged)
+            node_boxes[node, 2], node_boxes[node, 5] = _wider(z0, z1, enlarged)
         else:
             a = tree.left[node]
             b = tree.right[node]
             for c in range(3):
                 node_boxes[node, c] = min(node_boxes[a, c], node_boxes[b, c])
                 node_boxes[node, 3 + c] = max(node_boxes[a, 3 + c], node_boxes[b, 3 + c])
-    return True
+
+
+@compiled_part
+def _box_faces(leaf, scale, tolerance, enlarged, end, corners, work):
+    """Fill the boxes of the faces of one leaf, as `_refit` those of the nodes.
+
+    Most leaves are not visited in a search, so that they need none.
+    """
+    middle, vertices, boxes = work.middle, work.vertices, work.boxes
+    moves = len(end) > 0
+    for lane in range(LEAF_SIZE):
+        first = leaf * 3 * LEAF_SIZE + lane
+        one, two = corners[first], corners[first + LEAF_SIZE]
+        three = corners[first + 2 * LEAF_SIZE]
+        is_left_out = one < 0
+        if not is_left_out and not moves and enlarged <= tolerance:
+            is_left_out = _are_one_point(vertices, one, two, three)
+        at = leaf * 6 * LEAF_SIZE + lane
+        for c in range(3):
+            lower, upper = np.inf, -np.inf
+            if not is_left_out:
+                for v in (one, two, three):
+                    lower, upper = min(lower, vertices[v, c]), max(upper, vertices[v, c])
+                    if moves:
+                        place = (end[v, c] - middle[c]) * scale
+                        lower, upper = min(lower, place), max(upper, place)
+            boxes[at + c * LEAF_SIZE], boxes[at + (3 + c) * LEAF_SIZE] = _wider(
+                lower, upper, enlarged
+            )
+    work.has_boxes[leaf] = True
 
 
 @inlined
@@ -571,8 +603,6 @@ def drop_out_of_reach(
 
 @compiled
 def test_pairs(
-    pose: FloatArray,
-    scale: float,
     tolerance: float,
     tree: FaceTree,
     work: PoseWorkspace,
@@ -584,17 +614,15 @@ def test_pairs(
 
     Parameters
     ----------
-    pose, scale, tolerance, tree, work, found : as for `search_pose`, which would find them too
+    tolerance, tree, work, found : as for `search_pose`, which would find them too
     slots : (n, 2) of the pairs
     with_apart : whether to put in the other pairs as well, with depth 0
 
     Returns
     -------
-    n_found : number of pairs in `found`, without rules; 0 if `search_pose` refuses the pose
+    n_found : number of pairs in `found`, without rules
     """
     n_found = 0
-    if not _load_vertices(pose, scale, work):
-        return 0
     for n in range(len(slots)):
         for side in range(2):
             gather(tree.corners, work.vertices, slots[n, side], work.pair, side)
@@ -609,7 +637,6 @@ def test_pairs(
 
 @compiled
 def search_pose(
-    pose: FloatArray,
     scale: float,
     tolerance: float,
     tree: FaceTree,
@@ -629,24 +656,23 @@ def search_pose(
 
     Parameters
     ----------
-    pose : (V, 3) float64 array
     scale : factor from the pose's unit to normalised length
     tolerance : depth in normalised length up to which two faces touch rather than penetrate
-    tree, exclusions, uncounted, work : of one topology; `work` is overwritten. Pairs of faces below
-        nodes that are `uncounted` are not found.
+    tree, exclusions, uncounted, work : of one topology; `work` holds the vertices that
+        `load_vertices` has filled in, all else in it is overwritten. Pairs of faces below nodes
+        that are `uncounted` are not found.
     first_only : end the search at the first leaves that have a pair that counts
     found : `PairBuffer` for at least `LEAF_SIZE`² pairs, overwritten
     enlarged : if above 0, also find the pairs that are at most this far apart, and some that are
         farther, with depth 0; then no rules are filled in and `first_only` has no effect
-    end : (V, 3) of the pose that `pose` moves to, in its unit, or (0, 3); with it, pairs are found
-        that come so near anywhere on the linear path there
+    end : (V, 3) of the pose that this one moves to, in its unit, or (0, 3); with it, pairs are
+        found that come so near anywhere on the linear path there
     n_waiting : 0 to begin, else the value that the previous call returned
     leaf_size : `LEAF_SIZE`
 
     Returns
     -------
-    n_found : number of pairs that this call has put into `found`; -1 if a vertex is not finite or
-        beyond `MAX_DISTANCE`
+    n_found : number of pairs that this call has put into `found`
     n_waiting : number of pairs of nodes still to be visited, 0 at the end; `work.fraction` holds
         the estimated fraction of the search of each
     """
@@ -657,8 +683,7 @@ def search_pose(
     # With a plain 0, the search of leaves would be compiled twice.
     n_found: int = int(np.int64(0))
     if n_waiting == 0:
-        if not _refit(pose, scale, tolerance, enlarged, end, tree, work):
-            return -1, 0
+        _refit(scale, tolerance, enlarged, end, tree, work)
         n_waiting = _push(stack, 0, 0, 0)
         fraction[0] = 1.0
     while n_waiting > 0:
@@ -670,6 +695,9 @@ def search_pose(
         if tree.leaf[a] >= 0 and tree.leaf[b] >= 0:
             if n_found + LEAF_SIZE * LEAF_SIZE > len(found.slots):
                 return n_found, n_waiting + 1
+            for leaf in (tree.leaf[a], tree.leaf[b]):
+                if not work.has_boxes[leaf]:
+                    _box_faces(leaf, scale, tolerance, enlarged, end, tree.corners, work)
             n_before = n_found
             n_found = _search_leaves(
                 tree.corners,
@@ -808,7 +836,7 @@ def search_poses(
 
     Parameters
     ----------
-    poses : (B, V, 3) float64 array
+    poses, scale : as for `load_vertices`, one after another
     others up to leaf_size : as for `search_pose`; `first_only` tests remembered pairs first
     remembered : (R, 2) int32, slots of pairs that counted in earlier poses; overwritten
     n_remembered : (1,) number of pairs remembered so far
@@ -820,24 +848,23 @@ def search_poses(
 
     Returns
     -------
-    n_done : B, or the index of the pose that `search_pose` refuses
+    n_done : B, or the index of the pose that `load_vertices` refuses
     """
     nowhere = np.empty((0, 3))
     # Not a plain 0, as above.
     none = int(np.int64(0))
     for p in range(len(poses)):
+        if not load_vertices(poses[p], scale, work):
+            return p
         if first_only:
             n_known = min(n_remembered[0], len(remembered))
-            n_found = test_pairs(
-                poses[p], scale, tolerance, tree, work, remembered[:n_known], False, found
-            )
+            n_found = test_pairs(tolerance, tree, work, remembered[:n_known], False, found)
             if judge(tree, exclusions, found, none, n_found):
                 n_by_rule[p, COUNTED] = 1
                 continue
         n_waiting = none
         while True:
             n_found, n_waiting = search_pose(
-                poses[p],
                 scale,
                 tolerance,
                 tree,
@@ -851,8 +878,6 @@ def search_poses(
                 n_waiting,
                 leaf_size,
             )
-            if n_found < 0:
-                return p
             for pair in range(n_found):
                 n_by_rule[p, found.rule[pair]] += 1
             if first_only:

@@ -36,6 +36,7 @@ from lcollision_core.contact.kernels import (
     drop_excluded,
     drop_out_of_reach,
     judge,
+    load_vertices,
     remember,
     search_pose,
     search_poses,
@@ -81,7 +82,11 @@ def build_tree(vertices: FloatArray, faces: IntArray, component: IntArray) -> Fa
     corners = np.full((n_leaves * LEAF_SIZE, 3), -1, dtype=np.int32)
     corners[: len(faces)] = faces[order]
     by_leaf = corners.reshape(n_leaves, LEAF_SIZE, 3).transpose(0, 2, 1)
-    return FaceTree(slot_face, np.ascontiguousarray(by_leaf).reshape(-1), left, right, leaf, size)
+    ordered = np.sort(corners.reshape(n_leaves, 3 * LEAF_SIZE), axis=1)
+    is_new = (ordered >= 0) & (np.diff(ordered, axis=1, prepend=-1) != 0)
+    first = np.concatenate([[0], np.cumsum(is_new.sum(axis=1))]).astype(np.int32)
+    by_slot = np.ascontiguousarray(by_leaf).reshape(-1)
+    return FaceTree(slot_face, by_slot, left, right, leaf, size, first, ordered[is_new])
 
 
 @compiled_part
@@ -177,9 +182,9 @@ def allocate_work(tree: FaceTree, n_vertices: int) -> PoseWorkspace:
     return PoseWorkspace(
         middle=np.empty(3),
         vertices=np.empty((n_vertices, 3)),
-        rounded=np.empty((n_vertices, 3), dtype=np.float32),
         pair=np.empty((2, 3, 3)),
         boxes=np.empty(6 * n_slots, dtype=np.float32),
+        has_boxes=np.empty(n_slots // LEAF_SIZE, dtype=np.bool_),
         node_boxes=np.empty((n_nodes, 6), dtype=np.float32),
         stack=np.empty((4 * levels + 4, 2), dtype=np.int32),
         fraction=np.empty(4 * levels + 4),
@@ -584,10 +589,10 @@ class Searcher:
         swept = np.asarray([] if end is None else end, dtype=np.float64).reshape(-1, 3)
         if end is not None or with_coincident:
             enlarged = max(enlarged, DEPTH_TOLERANCE)
+        if not load_vertices(self._poses[0], self._scale, self._work):
+            self._refuse(self._poses[0], number)
         if first_only:
             n_found = test_pairs(
-                self._poses[0],
-                self._scale,
                 DEPTH_TOLERANCE,
                 self._tree,
                 self._work,
@@ -601,7 +606,6 @@ class Searcher:
                 return
         while True:
             n_found, self._waiting = search_pose(
-                self._poses[0],
                 self._scale,
                 DEPTH_TOLERANCE,
                 self._tree,
@@ -615,8 +619,6 @@ class Searcher:
                 self._waiting,
                 LEAF_SIZE,
             )
-            if n_found < 0:
-                self._refuse(self._poses[0], number)
             if end is not None:
                 moves = (swept - self._poses[0]) * self._scale
                 n_found = drop_out_of_reach(
