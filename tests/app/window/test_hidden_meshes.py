@@ -128,7 +128,7 @@ def test_a_part_too_small_to_be_dragged_has_a_handle_that_moves_it(
     for times in (0.5, 1.2, 12.0):
         position = near.focus + times * (near.position - near.focus)
         scene.view = replace(near, position=position)
-        mouse.mark(scene, shown(window))
+        mouse.mark(shown(window))
         handles[times] = [handle.domain for handle in mouse._handles if handle.is_shown]
     # Neither for large parts on the screen, nor for a small body.
     assert (handles[0.5], handles[12.0]) == ([], [])
