@@ -11,7 +11,7 @@ from PySide6.QtCore import QObject, Signal, Slot
 from app.editing.history import PoseHistory
 from app.editing.library import Library
 from app.editing.live_pose import Pins, PoseMotion
-from app.editing.tasks import Tasks
+from app.editing.tasks import Tasks, Work
 from app.editing.timeline import Timeline
 from app.work.threads import LongWork
 from lcollision_core.tasks.opening import OpenedModel
@@ -134,7 +134,7 @@ class PoseDocument(QObject):
 
     def new_pose(self) -> None:
         """Reset to the reference pose: unnamed, no file, no history; the library stays."""
-        self.tasks.cancel_incoming()
+        self.tasks.cancel(Work.INCOMING)
         self.history.begin_blank()
 
     def close(self, timeout: float = 5.0) -> bool:

@@ -580,7 +580,7 @@ class PoseMotion(QObject):
             return
         waiting, frame = self._mailbox.waiting, self.frame
         if waiting is not None and waiting.start is moving.start:
-            self._mailbox.withdraw()
+            self._mailbox.waiting = None
         # The motion's first request may have replaced the one for this pose, and the predictor
         # may have become ready during the drag.
         is_of_pose = frame is not None and frame.latent is self._history.latent
@@ -689,7 +689,7 @@ class PoseMotion(QObject):
     def show(self, frame: PoseFrame, state: DocumentState) -> None:
         """Apply a state whose frame is already computed, such as one of a motion."""
         self._moving = None
-        self._mailbox.withdraw()
+        self._mailbox.waiting = None
         self._take(frame, state)
         self._rested.start()
 

@@ -193,10 +193,6 @@ class Tasks(QObject):
         """The number of files waiting to be written."""
         return len(self._long.labels(_EXPORT))
 
-    def cancel_incoming(self) -> None:
-        """Stop loading another pose or model."""
-        self.cancel(Work.INCOMING)
-
     def forget_model(self) -> None:
         """Stop all work for the present model, except exports, which have their snapshots."""
         self.cancel_resolve()

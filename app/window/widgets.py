@@ -18,7 +18,6 @@ from PySide6.QtCore import (
     QSize,
     Qt,
     Signal,
-    Slot,
 )
 from PySide6.QtGui import (
     QAction,
@@ -674,9 +673,10 @@ class ListMenu(QMenu):
         fill: Callable[[], None] | None = None,
     ) -> None:
         super().__init__(title, parent, toolTipsVisible=True)
-        self._attempt, self._refill = attempt, fill
+        self._attempt = attempt
         if fill is not None:
-            self.aboutToShow.connect(self._on_shown)
+            self.aboutToShow.connect(self.clear)
+            self.aboutToShow.connect(fill)
 
     def entry(
         self,
@@ -695,12 +695,6 @@ class ListMenu(QMenu):
         action.setEnabled(enabled)
         action.triggered.connect(lambda: self._attempt(partial(act, *values)))
         return action
-
-    @Slot()
-    def _on_shown(self) -> None:
-        self.clear()
-        if self._refill is not None:
-            self._refill()
 
 
 class NumberBox(QDoubleSpinBox):

@@ -324,7 +324,7 @@ class PoseMailbox(QObject):
 
     Attributes
     ----------
-    waiting : the request that the worker gets next
+    waiting : the request that the worker gets next; None withdraws it
     """
 
     answered = Signal(object, object)
@@ -354,10 +354,6 @@ class PoseMailbox(QObject):
         if not self._is_due:
             self._is_due = True
             self._due.emit()
-
-    def withdraw(self) -> None:
-        """Drop the waiting request."""
-        self.waiting = None
 
     @Slot()
     def send(self) -> None:
