@@ -785,12 +785,7 @@ def sequence_files(
 
 def _placed(transforms: FloatArray, placement: RigidTransform | None) -> FloatArray:
     """Apply a placement to (J, 4, 4) transforms."""
-    if placement is None:
-        return transforms
-    matrix = np.eye(4)
-    matrix[:3, :3] = placement.scale * placement.rotation
-    matrix[:3, 3] = placement.translation
-    return np.asarray(matrix @ transforms, dtype=np.float64)
+    return transforms if placement is None else placement.matrix @ transforms
 
 
 def _is_same_file(one: Path, other: Path) -> bool:

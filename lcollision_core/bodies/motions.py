@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,14 @@ from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.extents import box_corners
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.motion import NOMINAL_RATE, GroundReport, Motion, is_worse, worse_spans
+from lcollision_core.motion import (
+    NOMINAL_RATE,
+    GroundReport,
+    Motion,
+    contact_report,
+    is_worse,
+    worse_spans,
+)
 from lcollision_core.motion.contacts import KeptContacts
 from lcollision_core.posing import ExactCheck, PoseSpace
 
@@ -163,10 +171,7 @@ def motion_of_smpl(body: Body, path: Path, fps: float | None = None) -> Motion:
     turns = np.zeros((len(motion), space.n_joints, 3))
     for joint, number in _pairs(space, motion):
         turns[:, joint] = motion.turns[:, number]
-    turns[:, 0] = (
-        scipy.spatial.transform.Rotation.from_matrix(frame)
-        * scipy.spatial.transform.Rotation.from_rotvec(turns[:, 0])
-    ).as_rotvec()
+    turns[:, 0] = _turned_by(frame, turns[:, 0])
     pelvis = space.rig.rest[0, :3, 3]
     codes = space.codes_of_rotations(turns, (pelvis + motion.places) @ frame.T - pelvis)
     times = np.arange(len(motion)) / (fps or motion.rate or NOMINAL_RATE)
@@ -198,15 +203,19 @@ def write_smpl(
     pelvis = space.rig.rest[0, :3, 3]
     for row, pose in enumerate(codes):
         own_turns, shift = space.rotations_of(pose)
-        own_turns[0] = (
-            scipy.spatial.transform.Rotation.from_matrix(frame.T)
-            * scipy.spatial.transform.Rotation.from_rotvec(own_turns[0])
-        ).as_rotvec()
+        own_turns[0] = _turned_by(frame.T, own_turns[0])
         for joint, number in _pairs(space, motion):
             turns[row, number] = own_turns[joint]
         places[row] = (pelvis + shift) @ frame - pelvis
     with atomic_write(path) as out:
         motion.write(out, frames, turns, places)
+
+
+def _turned_by(frame: FloatArray, turns: FloatArray) -> FloatArray:
+    """Return (..., 3) rotation vectors followed by the (3, 3) rotation of a frame."""
+    rotation = scipy.spatial.transform.Rotation
+    turned: FloatArray = (rotation.from_matrix(frame) * rotation.from_rotvec(turns)).as_rotvec()
+    return turned
 
 
 def _read(body: Body, path: Path) -> tuple[RigBody, SmplMotion]:
@@ -656,11 +665,9 @@ def write_clips(
         raise MeshFileError("has another rig", "name the file of the motion", where=file)
     require_written(path, character)
     written = _ClipsOfFile(as_gltf(character), space, body.exact_check(), file)
-    put_back: list[list[range]] = [[] for _ in changes]
     data = written.changed(changes)
     as_read = FileClips.read(data, file)
-    for number, change in enumerate(changes):
-        put_back[number] = written.worse_spans(change, as_read)
+    put_back = [written.worse_spans(change, as_read) for change in changes]
     if any(put_back):
         changes = [
             replace(pair, spans=[span for span in pair.spans if span not in worse])
@@ -725,16 +732,13 @@ class _ClipsOfFile:
     def changed(self, changes: Sequence[MotionChange]) -> bytes:
         """Return the file with the changed spans."""
 
-        def frames_of(spans: Sequence[range]) -> list[int]:
-            return [frame for span in spans for frame in span]
-
         def shapes(change: MotionChange) -> FloatArray | None:
-            frames = frames_of(change.spans)
+            frames = list(chain.from_iterable(change.spans))
             moved = change.after.codes[frames] - change.before.codes[frames]
             return shapes_in_file(self.space, self.made, moved)
 
         def transforms(motion: Motion, spans: Sequence[range]) -> FloatArray:
-            frames = frames_of(spans)
+            frames = chain.from_iterable(spans)
             rows = (_joints(motion, frame, self.space) for frame in frames)
             return np.array([transforms[self.made.joints] for transforms in rows])
 
@@ -802,9 +806,7 @@ class _ClipsOfFile:
     ) -> list[npt.NDArray[np.bool_]]:
         """Return which frames of motions are free as read back from a file."""
         character = character_of(clips.scene, self.file)
-        back = self.made.frame.inverse()
-        place = np.eye(4)
-        place[:3, :3], place[:3, 3] = back.scale * back.rotation, back.translation
+        place = self.made.frame.inverse().matrix
         # Parts hidden at rest may have become joints.
         file_rig = self.made.character.rig
         assert file_rig is not None
@@ -851,7 +853,7 @@ def _write_own(
     (change,) = changes
     check, put_back = body.exact_check(), []
     while True:
-        frames = [frame for span in change.spans for frame in span]
+        frames = list(chain.from_iterable(change.spans))
         if not _is_bvh(path):
             write_smpl(path, body, file, frames, change.after.codes[frames])
         else:
@@ -882,6 +884,12 @@ def _write_bvh(
         carried = Retargeting.of(bvh.motion, space, file).changed(frames, before, after)
         data = bvh.with_frames(frames, *carried)
     write_bytes(path, data)
+
+
+def contact_facts(motion: Motion, check: ExactCheck) -> dict[str, Any] | None:
+    """Return the values of a motion's `ContactReport` for reports; None if it has none."""
+    report = contact_report(motion, check)
+    return None if report is None else report.to_json()
 
 
 def ground_report(body: Body, motion: Motion) -> GroundReport | None:

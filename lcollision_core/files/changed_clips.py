@@ -129,7 +129,7 @@ def _change(file: CharacterFile, patch: GltfDocument, rig: Rig, change: ChangedC
     tracks = ClipTracks.of(file.document, change.clip, file.scene.parts)
     animations = patch.description["animations"]
     animation = animations[tracks.number] = deepcopy(animations[tracks.number])
-    turns = _local_turns(rig, change)
+    turns, turn_of = _local_turns(rig, change), scipy.spatial.transform.Rotation
     for joint, node in enumerate(rig.nodes.tolist()):
         rotation, translation, scale = (
             tracks.track(node, path, float(change.times[0]))
@@ -140,17 +140,10 @@ def _change(file: CharacterFile, patch: GltfDocument, rig: Rig, change: ChangedC
             joint_turns = turns[rows, joint]
             if np.abs(joint_turns - np.eye(4)).max() <= _UNCHANGED:
                 continue
-            old = scipy.spatial.transform.Rotation.from_quat(
-                unit_quaternions(rotation.at(at)[:, 0])
-            )
+            old = turn_of.from_quat(unit_quaternions(rotation.at(at)[:, 0]))
             sizes = scale.at(at)[:, 0]
-            turned = (
-                old
-                * scipy.spatial.transform.Rotation.from_matrix(
-                    _unscaled(joint_turns[:, :3, :3], sizes)
-                )
-            ).as_quat()
-            new_rotation = new_rotation.with_span(before, at, after, turned[:, None])
+            turned = old * turn_of.from_matrix(_unscaled(joint_turns[:, :3, :3], sizes))
+            new_rotation = new_rotation.with_span(before, at, after, turned.as_quat()[:, None])
             if np.abs(joint_turns[:, :3, 3]).max() > _UNCHANGED:
                 moved = translation.at(at)[:, 0] + old.apply(sizes * joint_turns[:, :3, 3])
                 new_translation = new_translation.with_span(before, at, after, moved[:, None])

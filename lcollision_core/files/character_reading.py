@@ -590,11 +590,9 @@ def as_gltf(character: Character) -> GltfCharacter:
         still = RigidTransform(np.eye(3), np.zeros(3))
         return GltfCharacter(character, still, rows, rows, joints, {})
     frame = written_frame(character)
-    place = np.eye(4)
-    place[:3, :3] = frame.scale * frame.rotation
     source = Path(character.source)
     with as_file_error(source, "cannot be written as GLB"):
-        document = gltf_of(file.scene, place, character.name, source)
+        document = gltf_of(file.scene, frame.matrix, character.name, source)
         written = character_of(scene_of(GltfDocument(document.data, source)), source)
         if len(written.joined) != len(document.vertices):
             raise MeshFileError("some of its parts would be lost")

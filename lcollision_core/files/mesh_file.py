@@ -15,9 +15,9 @@ from lcollision_core.errors import MeshFileError, ShapeError
 from lcollision_core.files.mesh.obj import ObjDetail
 from lcollision_core.files.mesh.obj import encode as encode_obj
 from lcollision_core.files.mesh.polygons import (
-    MAX_FACES,
     Polygons,
     first_at_each_position,
+    require_plausible_count,
     triangulate,
     with_order_of,
 )
@@ -207,9 +207,9 @@ def _shared(topology: Topology) -> Topology:
 
 def coarseness_of(vertices: npt.NDArray[Any], topology: Topology) -> str | None:
     """Describe the precision that a mesh lost by being stored in float32; None if it is enough."""
-    if can_hold(vertices, topology, np.float32):
-        return None
     step, ratio = rounding_step(vertices, topology, np.float32)
+    if ratio <= LARGEST_RATIO:
+        return None
     return (
         f"so far from the origin its coordinates are stored in steps of {step:.2g}, {ratio:.0%} of "
         f"a short edge"
@@ -256,11 +256,8 @@ def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:
 def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int64]) -> None:
     if len(vertices) == 0:
         raise MeshFileError("it contains no vertices")
-    for count, what in ((len(faces), "faces"), (len(vertices), "vertices")):
-        if count > MAX_FACES:
-            raise MeshFileError(
-                f"it holds {count} {what}, at most {MAX_FACES} can be read", "decimate the mesh"
-            )
+    require_plausible_count(len(faces), "faces")
+    require_plausible_count(len(vertices), "vertices")
     vertex = first_not_finite(vertices)
     if vertex is not None:
         raise MeshFileError(

@@ -44,6 +44,13 @@ class RigidTransform:
         turned: FloatArray = np.asarray(vertices, np.float64) @ self.rotation.T
         return self.scale * turned + self.translation
 
+    @property
+    def matrix(self) -> FloatArray:
+        """(4, 4) the transform of homogeneous points."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
+        return matrix
+
     def inverse(self) -> RigidTransform:
         """Return the inverse transform."""
         back = 1.0 / self.scale

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -233,7 +233,7 @@ def answer_resolve_motion(opened: OpenedCharacter, request: m.ResolveMotion, job
         "spans": [[span.start, span.stop] for span in resolved.spans],
         "report": asdict(report),
         "joints": joints,
-        "turns": turns[_frames(resolved.spans)],
+        "turns": turns[list(chain.from_iterable(resolved.spans))],
         "seconds": working_seconds() - start,
     }
 
@@ -289,10 +289,6 @@ def propose(opened: OpenedCharacter, request: m.ProposeRules, job: Job) -> Reply
         "colliding": proposed.n_colliding,
         "colliding_then": proposed.n_colliding_then,
     }
-
-
-def _frames(spans: Sequence[range]) -> list[int]:
-    return [frame for span in spans for frame in span]
 
 
 def _motion(

@@ -19,7 +19,12 @@ from lcollision_core.bodies import (
     estimated_free,
     open_body,
 )
-from lcollision_core.bodies.motions import ground_facts, is_of_skeleton, read_motions
+from lcollision_core.bodies.motions import (
+    contact_facts,
+    ground_facts,
+    is_of_skeleton,
+    read_motions,
+)
 from lcollision_core.bodies.partners import with_joint_map
 from lcollision_core.bodies.scene_file import body_of_scene, is_scene_file
 from lcollision_core.compiled import working_seconds
@@ -39,7 +44,6 @@ from lcollision_core.motion import (
     NOMINAL_RATE,
     Motion,
     ScreenedMotion,
-    contact_report,
     screen_frames,
     screen_motion,
 )
@@ -278,15 +282,10 @@ def _check_motions(
         verdict = _verdict(
             path, motion.name, motion.times, motion.rate, screened, names, rules, request
         )
-        contacts_kept = contact_report(motion, check)
-        contacts = None if contacts_kept is None else contacts_kept.to_json()
+        estimates = int(estimated.sum())
+        contacts, ground = contact_facts(motion, check), ground_facts(body, motion)
         verdicts.append(
-            replace(
-                verdict,
-                estimated_frames=int(estimated.sum()),
-                contacts=contacts,
-                ground=ground_facts(body, motion),
-            )
+            replace(verdict, estimated_frames=estimates, contacts=contacts, ground=ground)
         )
     return verdicts
 

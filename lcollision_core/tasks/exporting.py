@@ -172,22 +172,15 @@ def refuse_to_replace(
     """
     if in_place:
         return
-    read = {(status.st_dev, status.st_ino) for path in sources if (status := _status(path))}
+    read = {stamp[:2] for path in sources if (stamp := file_stamp(path))}
     for path in outputs:
-        status = _status(path)
-        if status and (status.st_dev, status.st_ino) in read:
+        stamp = file_stamp(path)
+        if stamp and stamp[:2] in read:
             raise LCollisionError(
                 "is an input, which the output would replace",
                 "name another output, or add --in-place",
                 where=path,
             )
-
-
-def _status(path: Path) -> os.stat_result | None:
-    try:
-        return path.stat()
-    except OSError:
-        return None
 
 
 def source_files(model: Body, request: ExportRequest | None = None) -> list[Path]:

@@ -446,8 +446,8 @@ def resolve_one(
 ) -> tuple[MotionChange, ResolvedClip]:
     """Resolve one motion; its frames are named from `first` on in the run."""
     from lcollision_core.bodies import NamedPose
-    from lcollision_core.bodies.motions import MotionChange, ground_facts
-    from lcollision_core.motion import MotionReport, contact_report, resolve_motion, screen_motion
+    from lcollision_core.bodies.motions import MotionChange, contact_facts, ground_facts
+    from lcollision_core.motion import MotionReport, resolve_motion, screen_motion
 
     start, body, options = working_seconds(), request.body, request.options
     substeps, workers = request.choice.substeps, request.workers
@@ -486,8 +486,7 @@ def resolve_one(
     kept_spans = [span.to_json(body.domain_names) for span in resolution.kept]
     row = _row(request, motion, before, after, report, kept_spans, start)
     row.output, row.collides_between = str(request.output.path), resolution.touching
-    contacts = contact_report(resolution.motion, check)
-    row.contacts = None if contacts is None else contacts.to_json()
+    row.contacts = contact_facts(resolution.motion, check)
     row.ground = ground_facts(body, resolution.motion)
     return MotionChange(
         motion, resolution.motion, resolution.spans, options.frame.largest_change
@@ -496,7 +495,8 @@ def resolve_one(
 
 def _check_motion(request: ResolveMotionsRequest, motion: Motion, job: Job) -> ResolvedClip:
     """Check one motion without changing it."""
-    from lcollision_core.motion import MotionReport, contact_report, screen_motion
+    from lcollision_core.bodies.motions import contact_facts
+    from lcollision_core.motion import MotionReport, screen_motion
 
     start, choice = working_seconds(), request.choice
     screened = screen_motion(
@@ -510,8 +510,7 @@ def _check_motion(request: ResolveMotionsRequest, motion: Motion, job: Job) -> R
     )
     row = _row(request, motion, screened, screened, MotionReport(), [], start)
     row.collides_between = screened.collides_between
-    contacts = contact_report(motion, request.body.exact_check())
-    row.contacts = None if contacts is None else contacts.to_json()
+    row.contacts = contact_facts(motion, request.body.exact_check())
     return row
 
 

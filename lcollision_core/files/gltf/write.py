@@ -34,6 +34,7 @@ from lcollision_core.files.scene.transforms import (
     decompose,
     signs_on_one_side,
 )
+from lcollision_core.meshes.normals import unit
 from lcollision_core.meshes.topology import FloatArray
 
 
@@ -231,11 +232,9 @@ class _Maker:
             )
         }
         if look.normals is not None:
-            normals = look.normals @ np.linalg.pinv(turn[:3, :3])
-            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-            unit = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
-            unit[lengths[:, 0] == 0.0, 1] = 1.0
-            attributes["NORMAL"] = self._vectors(unit)
+            normals = unit(look.normals @ np.linalg.pinv(turn[:3, :3]))
+            normals[~normals.any(axis=1), 1] = 1.0
+            attributes["NORMAL"] = self._vectors(normals)
         if look.uv.any():
             attributes["TEXCOORD_0"] = self._vectors(look.uv)
         if part.is_skinned:
@@ -347,10 +346,10 @@ class _Maker:
                 if path == "rotation":
                     signs = signs_on_one_side(np.concatenate([rest, values]))
                     values = signs[1:, None] * values
-                unit = size if path == "translation" else float(np.abs(values).max())
+                extent = size if path == "translation" else float(np.abs(values).max())
                 # Readers take a node that a clip moves for a joint, even if it stays in place.
                 is_named = path == "translation" and node in moved
-                if is_named or np.abs(values - rest).max() > _STILL * unit:
+                if is_named or np.abs(values - rest).max() > _STILL * extent:
                     add(node, path, values)
         for index, part in enumerate(self._scene.parts):
             rest, values = (self._poses[pose].weights[index] for pose in (0, number))
