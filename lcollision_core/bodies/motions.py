@@ -43,7 +43,6 @@ from lcollision_core.files import (
     file_stamp,
     read_pose_set,
 )
-from lcollision_core.files.animated import frame_rate
 from lcollision_core.files.changed_clips import ChangedClip, FileClips, changed_gltf
 from lcollision_core.files.character import ClipFrames
 from lcollision_core.files.character_reading import character_of, character_of_smpl
@@ -56,6 +55,7 @@ from lcollision_core.files.motion.smpl import (
     is_smpl_motion,
     read_smpl_motion,
 )
+from lcollision_core.files.pose_set_reading import frame_rate
 from lcollision_core.files.safe import atomic_write, write_bytes
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene_files import open_rigged, read_scene

@@ -49,7 +49,7 @@ from lcollision_core.errors import (
 )
 from lcollision_core.files import PoseSet
 from lcollision_core.files.character import Character, Rig
-from lcollision_core.files.pose_set import require_usable_reference
+from lcollision_core.files.pose_set_reading import require_usable_reference
 from lcollision_core.files.safe import MAX_ITEMS
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import fit_rigid, part_groups

@@ -1,12 +1,10 @@
-"""Pose sets, poses of one body as meshes that share their faces: read, thin and write them."""
+"""Pose sets: poses of one body as meshes that share their faces; thin, join and write them."""
 
 from __future__ import annotations
 
 import json
 import os
-import re
 import sys
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,23 +13,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError, ShapeError, listed
-from lcollision_core.files.animated import read_animated
+from lcollision_core.errors import MeshFileError, PoseSetError, ShapeError
 from lcollision_core.files.mesh_file import (
-    KEEP_PRECISION,
-    LARGEST_COORDINATE,
-    audit_mesh,
-    coarseness_of,
-    first_not_finite,
     in_unit,
-    read_mesh,
 )
-from lcollision_core.files.safe import MAX_ITEMS, atomic_write, read_npz, write_npz
-from lcollision_core.files.table import ANIMATED_SUFFIXES, GLTF_SUFFIXES, READABLE_SUFFIXES
+from lcollision_core.files.safe import MAX_ITEMS, atomic_write, write_npz
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import parse_json
 from lcollision_core.meshes.contact_rules import (
-    CHARACTER_REST_EXCLUSION,
     MAX_GROUP_NAME_LENGTH,
     STRICT,
     ContactRules,
@@ -44,8 +33,7 @@ from lcollision_core.meshes.face_groups import (
     require_groups,
     runs_to_faces,
 )
-from lcollision_core.meshes.outliers import outlier_poses
-from lcollision_core.meshes.topology import FloatArray, Topology, degenerate_faces
+from lcollision_core.meshes.topology import FloatArray, Topology
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -174,14 +162,6 @@ def provenance_from_arrays(arrays: Arrays) -> dict[str, Any]:
 FORMAT_VERSION = 2
 """The latest version that is read; sets without the rules it added are written as version 1."""
 
-_MESH_ARRAYS = (("vertices", "V"), ("faces", "F"))
-_EXTRA_ARRAYS = (
-    *("format_version", "names", "notes", "near_exclusion", "up_axis", "vertex_labels"),
-    *("metres", "provenance"),
-    *RULE_ARRAYS,
-)
-_MAX_TEXT_LENGTH = 500
-
 
 @dataclass(frozen=True, eq=False)
 class PoseSet:
@@ -281,253 +261,6 @@ class PoseSet:
         return self.topology.faces
 
 
-def natural_key(path: Path) -> tuple[list[str | int], str]:
-    """Return a sort key that puts mesh2.obj before mesh10.obj, ignoring case."""
-    parts = re.split(r"([0-9]+)", path.stem.casefold())
-    # Every second part is digits, so numbers are only compared with numbers.
-    return [int(part) if index % 2 else part for index, part in enumerate(parts)], path.name
-
-
-def mesh_files(folder: Path) -> tuple[list[Path], list[str]]:
-    """Return the mesh files of a folder in natural order, and the names of its other entries.
-
-    Hidden files are ignored.
-
-    Raises
-    ------
-    MeshFileError : the folder cannot be listed.
-    """
-    try:
-        entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
-    except OSError as error:
-        raise MeshFileError.because(folder, "cannot be listed", error) from error
-    files = [entry for entry in entries if entry.suffix.lower() in READABLE_SUFFIXES]
-    others = sorted({entry.name for entry in entries} - {file.name for file in files})
-    return sorted(files, key=natural_key), others
-
-
-def read_pose_set(
-    path: str | os.PathLike[str],
-    job: Job = UNWATCHED,
-    *,
-    clip: str | None = None,
-    fps: float | None = None,
-    topology: Topology | None = None,
-) -> PoseSet:
-    """Read a pose set, and refuse it at the first defect.
-
-    Parameters
-    ----------
-    path : a folder of mesh files of one format, read in natural order; an .npz file with
-        `vertices` (N, V, 3) and `faces` (F, 3), also called `V` and `F`; a .glb, .gltf, .vrm or
-        .fbx file with animations, whose rest pose becomes pose 0; or a .pc2 or .mdd file with its
-        mesh beside it, which becomes pose 0
-    job : reports (poses done, all poses); polled between poses
-    clip : name of one animation of a file; None for all
-    fps : frames per second of an animation; None for its keys, at most 30 per second
-    topology : topology of another set of the same body, whose triangulation of polygons is used
-
-    Returns
-    -------
-    the pose set; its vertices are float64, except that an .npz file's keep their precision
-
-    Raises
-    ------
-    MeshFileError : the folder or a file cannot be read.
-    PoseSetError : a pose has another vertex count or other faces than the first, another size or
-        vertex order than most, or a triangle of the first has no area.
-    CancelledError : the job was cancelled.
-    """
-
-    def refuse(defect: LCollisionError) -> None:
-        raise defect
-
-    pose_set = collect_poses(Path(path), refuse, job, clip, fps, topology).pose_set
-    if pose_set is None:
-        raise MeshFileError("contains no poses", "name another folder or file", where=path)
-    require_usable_reference(pose_set)
-    return pose_set
-
-
-def require_usable_reference(poses: PoseSet) -> None:
-    """Refuse a set whose reference has a face without area.
-
-    Raises
-    ------
-    PoseSetError : the message names the set's source.
-    """
-    flat = degenerate_faces(poses.topology, poses.vertices[0])
-    if len(flat):
-        face = int(flat[0])
-        raise PoseSetError(
-            f"cannot be used: {len(flat)} faces of the reference, {_numbered(poses, 0)}, "
-            f"have no area, the first is face {face} between vertices "
-            f"{poses.faces[face].tolist()}",
-            "remove them from all poses",
-            where=poses.source,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class PoseSetInspection:
-    """Result of reading a path that should hold a pose set.
-
-    Attributes
-    ----------
-    pose_set : the poses that match the first readable one; None if none can be used
-    n_found : number of poses present, usable or not
-    same_topology : whether all readable poses share their vertex count and faces
-    defects : defects of the set and its poses, in the order found
-    problems : a sentence for each defect, including those of the reference, pose 0
-    """
-
-    pose_set: PoseSet | None
-    n_found: int = 0
-    same_topology: bool = False
-    defects: tuple[LCollisionError, ...] = ()
-    problems: tuple[str, ...] = ()
-
-
-def collect_poses(
-    path: Path,
-    report: Callable[[LCollisionError], None],
-    job: Job = UNWATCHED,
-    clip: str | None = None,
-    fps: float | None = None,
-    topology: Topology | None = None,
-) -> PoseSetInspection:
-    """Read all poses that match the first, and report each defect.
-
-    Parameters
-    ----------
-    path : see `read_pose_set`
-    report : called with each defect; raise in it to stop reading
-    job, clip, fps, topology : see `read_pose_set`
-    """
-    try:
-        is_folder, exists = path.is_dir(), path.exists()
-    except OSError as error:
-        report(MeshFileError.unreadable(path, error, "check the name"))
-        return PoseSetInspection(None)
-    if is_folder:
-        return _without_outliers(_collect_folder(path, report, job, topology), report)
-    suffix = path.suffix.lower()
-    if exists and suffix in ANIMATED_SUFFIXES:
-        return _collect_frames(path, report, job, clip, fps, topology)
-    if exists and suffix == ".npz":
-        return _without_outliers(_collect_npz(path, report, job), report)
-    what = "is not a pose set" if exists else "does not exist"
-    next_step = "name a folder of meshes, a character or an .npz file"
-    if exists and suffix in READABLE_SUFFIXES:
-        what, next_step = "is one mesh, not a pose set", "name its folder"
-    report(MeshFileError(what, next_step, where=path))
-    return PoseSetInspection(None)
-
-
-def _too_far_to_compute(where: str, vertices: npt.NDArray[Any]) -> PoseSetError | None:
-    """Return the error for a vertex of a pose that is not finite or too far out, if any."""
-    vertex = first_not_finite(vertices, LARGEST_COORDINATE)
-    if vertex is None:
-        return None
-    what = (
-        f"has vertex {vertex} (from 0) at ({', '.join(f'{x:g}' for x in vertices[vertex])}), which "
-        f"is not finite or beyond {LARGEST_COORDINATE:g}"
-    )
-    return PoseSetError(what, "remove or scale that pose", where=where)
-
-
-def _without_outliers(
-    collected: PoseSetInspection, report: Callable[[LCollisionError], None]
-) -> PoseSetInspection:
-    """Leave out poses of another body or in another unit."""
-    poses = collected.pose_set
-    outliers = {} if poses is None else outlier_poses(poses.topology, poses.vertices)
-    if poses is None or not outliers:
-        return collected
-    for pose, defect in outliers.items():
-        report(PoseSetError.from_error(defect, f"pose {poses.names[pose]} of {poses.source}"))
-    inliers = [pose for pose in range(len(poses)) if pose not in outliers]
-    return replace(collected, pose_set=_only(poses, inliers))
-
-
-def _only(poses: PoseSet, kept: list[int]) -> PoseSet | None:
-    """Return the kept poses of a set, or None if there are none."""
-    if len(kept) in (0, len(poses)):
-        return poses if kept else None
-    names = tuple(poses.names[pose] for pose in kept)
-    return replace(poses, vertices=poses.vertices[kept], names=names)
-
-
-def _collect_folder(
-    path: Path,
-    report: Callable[[LCollisionError], None],
-    job: Job,
-    expected: Topology | None,
-) -> PoseSetInspection:
-    try:
-        files, others = mesh_files(path)
-    except MeshFileError as error:
-        report(error)
-        return PoseSetInspection(None)
-    formats = Counter(file.suffix.lower() for file in files)
-    if len(formats) != 1:
-        counts = ", ".join(f"{count} {suffix}" for suffix, count in sorted(formats.items()))
-        what, next_step = "contains no mesh", "name a folder of .obj, .ply, .off or .stl files"
-        if formats:
-            what = f"contains meshes of several formats ({counts})"
-            next_step = "keep one format in a folder"
-        report(MeshFileError(what, next_step, where=path))
-        return PoseSetInspection(None, len(files))
-    notes: Counter[str] = Counter()
-    names: list[str] = []
-    topology: Topology | None = None
-    vertices = np.empty((0, 0, 3))
-    same_topology = True
-    for pose, file in enumerate(files):
-        job.check()
-        try:
-            mesh = read_mesh(file, topology=topology or expected)
-        except MeshFileError as error:
-            report(error)
-        else:
-            if topology is None:
-                topology = mesh.topology
-                shape = len(files), topology.n_vertices, 3
-                if np.prod(shape) > MAX_ITEMS:
-                    what = f"holds {shape[0]} poses of {shape[1]} vertices, more than {MAX_ITEMS}"
-                    advice = "keep fewer poses or decimate them"
-                    report(MeshFileError(f"{what} coordinates", advice, where=path))
-                    return PoseSetInspection(None, len(files))
-                vertices = np.empty(shape, dtype=np.float64)
-            where = f"pose {pose} ({file.name})"
-            if (defect := disagreement(where, mesh.topology, topology)) is not None:
-                same_topology = False
-                report(defect)
-            elif (too_far := _too_far_to_compute(where, mesh.vertices)) is not None:
-                report(too_far)
-            elif mesh.coarseness:
-                report(PoseSetError(f"is damaged: {mesh.coarseness}", KEEP_PRECISION, where=where))
-            else:
-                vertices[len(names)] = mesh.vertices
-                names.append(file.name)
-                notes.update(mesh.notes)
-        job.report(pose + 1, len(files))
-    if topology is None:
-        return PoseSetInspection(None, len(files))
-    sentences = [
-        note if times == len(names) else f"{note} (in {times} of {len(names)} files)"
-        for note, times in notes.items()
-    ]
-    if others:
-        sentences.append(f"entries that are no meshes were ignored: {listed(others, 5)}")
-    # The glTF standard defines y as up.
-    up_axis = 1 if formats.keys() <= set(GLTF_SUFFIXES) else None
-    pose_set = PoseSet(
-        vertices[: len(names)], topology, tuple(names), path, tuple(sentences), up_axis=up_axis
-    )
-    return PoseSetInspection(pose_set, len(files), same_topology)
-
-
 def disagreement(where: str, found: Topology, expected: Topology) -> PoseSetError | None:
     """Return the error for a mesh whose topology differs from its set's, None if it is equal."""
     if found.n_vertices != expected.n_vertices:
@@ -547,124 +280,6 @@ def disagreement(where: str, found: Topology, expected: Topology) -> PoseSetErro
         expected=needed,
         got=got,
     )
-
-
-def _collect_frames(
-    path: Path,
-    report: Callable[[LCollisionError], None],
-    job: Job,
-    clip: str | None,
-    fps: float | None,
-    topology: Topology | None,
-) -> PoseSetInspection:
-    try:
-        frames = read_animated(path, clip, fps, job, topology)
-    except MeshFileError as error:
-        report(error)
-        return PoseSetInspection(None)
-    pose_set = PoseSet(
-        frames.vertices,
-        frames.topology,
-        frames.names,
-        path,
-        frames.notes,
-        up_axis=frames.up_axis,
-        vertex_labels=frames.vertex_labels,
-        rules=ContactRules(rest_exclusion=CHARACTER_REST_EXCLUSION),
-        groups=frames.groups,
-        metres=frames.metres,
-    )
-    usable = _usable(pose_set, report)
-    return PoseSetInspection(usable, len(frames.vertices), same_topology=True)
-
-
-def _collect_npz(
-    path: Path, report: Callable[[LCollisionError], None], job: Job
-) -> PoseSetInspection:
-    try:
-        arrays, name_of = read_npz(path, (*_MESH_ARRAYS, *((name,) for name in _EXTRA_ARRAYS)))
-        vertices, faces = _meshes_of(arrays, name_of)
-        topology = Topology(faces, vertices.shape[1])
-        names = tuple(f"pose {pose}" for pose in range(len(vertices)))
-        extras = {"names": names} | _extras_of(arrays, vertices.shape)
-        rules = rules_from_arrays(arrays, extras.pop("near_exclusion", 0.0))
-        groups = groups_from_arrays(arrays, topology.n_faces)
-        extras["provenance"] = provenance_from_arrays(arrays)
-        pose_set = PoseSet(vertices, topology, source=path, rules=rules, groups=groups, **extras)
-    except LCollisionError as error:
-        report(MeshFileError.because(path, "cannot be read as a pose set", error))
-        return PoseSetInspection(None)
-    usable = _usable(pose_set, report, is_rounded=vertices.dtype == np.float32)
-    job.report(len(vertices), len(vertices))
-    return PoseSetInspection(usable, len(vertices), same_topology=True)
-
-
-def _numbered(poses: PoseSet, pose: int) -> str:
-    """Return a pose's number from 0, and its name if that says more."""
-    number, name = f"pose {pose}", poses.names[pose]
-    return number if name == number else f"{number} ({name})"
-
-
-def _usable(
-    poses: PoseSet, report: Callable[[LCollisionError], None], *, is_rounded: bool = False
-) -> PoseSet | None:
-    """Return the poses that can be computed with; check how coarse they are if rounded."""
-    kept = []
-    for pose, vertices in enumerate(poses.vertices):
-        where = f"{_numbered(poses, pose)} of {poses.source}"
-        if (too_far := _too_far_to_compute(where, vertices)) is not None:
-            report(too_far)
-        elif is_rounded and (coarseness := coarseness_of(vertices, poses.topology)):
-            report(PoseSetError(f"is damaged: {coarseness}", KEEP_PRECISION, where=where))
-        else:
-            kept.append(pose)
-    return _only(poses, kept)
-
-
-def _meshes_of(
-    arrays: dict[str, npt.NDArray[Any]], held: Sequence[str]
-) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    meshes = []
-    for name, short_name in _MESH_ARRAYS:
-        if name not in arrays:
-            others = listed(sorted(held))[:_MAX_TEXT_LENGTH]
-            only = f", only {others}" if others else ""
-            raise MeshFileError(f"it has no array {name!r} or {short_name!r}{only}")
-        meshes.append(arrays[name])
-    vertices, faces = meshes
-    if vertices.ndim != 3 or vertices.shape[2] != 3 or 0 in vertices.shape:
-        raise MeshFileError.must_be("vertices", "(N, V, 3) with N, V > 0", vertices.shape)
-    if vertices.dtype.kind != "f" or vertices.dtype.itemsize not in (4, 8):
-        raise MeshFileError.must_be("vertices", "float32 or float64", vertices.dtype)
-    native = np.float32 if vertices.dtype.itemsize == 4 else np.float64
-    return np.ascontiguousarray(vertices, dtype=native), faces
-
-
-def _extras_of(arrays: dict[str, npt.NDArray[Any]], shape: tuple[int, ...]) -> dict[str, Any]:
-    """Return the optional arguments of `PoseSet` from the arrays beside (N, V, 3) vertices."""
-    extras: dict[str, Any] = {}
-    for name, kinds, needed in (
-        ("format_version", "iu", ()),
-        ("near_exclusion", "fiu", ()),
-        ("metres", "f", ()),
-        ("up_axis", "iu", ()),
-        ("names", "U", shape[:1]),
-        ("notes", "U", (np.size(arrays.get("notes", ())),)),
-        ("vertex_labels", "U", shape[1:2]),
-    ):
-        value = arrays.get(name)
-        if value is None:
-            continue
-        if value.shape != needed or value.dtype.kind not in kinds:
-            expected = f"{needed} strings" if kinds == "U" else "one number"
-            raise MeshFileError.must_be(name, expected, f"{value.dtype} {value.shape}")
-        convert = float if "f" in kinds else int
-        extras[name] = texts_of(value, name, _MAX_TEXT_LENGTH) if kinds == "U" else convert(value)
-    if (version := extras.pop("format_version", FORMAT_VERSION)) > FORMAT_VERSION:
-        raise MeshFileError.too_new("it", version, FORMAT_VERSION)
-    if "vertex_labels" in extras:
-        extras["vertex_labels"] = np.array(extras["vertex_labels"])
-    return extras
 
 
 def _require_labels(vertex_labels: npt.NDArray[np.str_]) -> None:
@@ -852,28 +467,3 @@ def _squared_distances(poses: FloatArray, vertices: FloatArray) -> FloatArray:
     squares = (poses**2).sum(axis=(1, 2)) + (vertices**2).sum()
     distances: FloatArray = (squares - 2.0 * values.sum(axis=1)) / len(vertices)
     return distances
-
-
-def inspect_pose_set(
-    path: str | os.PathLike[str],
-    job: Job = UNWATCHED,
-) -> PoseSetInspection:
-    """Read the usable poses of a pose set and list every defect instead of raising the first.
-
-    Parameters
-    ----------
-    path : see `read_pose_set`
-    job : reports (poses done, all poses)
-
-    Returns
-    -------
-    the usable poses and the defects
-    """
-    defects: list[LCollisionError] = []
-    poses = collect_poses(Path(path), defects.append, job)
-    problems = [str(defect) for defect in defects]
-    if poses.pose_set is not None:
-        where = _numbered(poses.pose_set, 0)
-        reference = audit_mesh(poses.pose_set.topology, poses.pose_set.vertices[0])
-        problems += [f"{where}: {problem}" for problem in reference]
-    return replace(poses, defects=tuple(defects), problems=tuple(problems))

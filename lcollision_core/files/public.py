@@ -24,15 +24,12 @@ from lcollision_core.files.mesh_file import (
     read_mesh,
     write_mesh,
 )
-from lcollision_core.files.pose_set import (
-    PoseSet,
+from lcollision_core.files.pose_set import PoseSet, concatenated, thinned, write_pose_set
+from lcollision_core.files.pose_set_reading import (
     PoseSetInspection,
-    concatenated,
     inspect_pose_set,
     mesh_files,
     read_pose_set,
-    thinned,
-    write_pose_set,
 )
 from lcollision_core.files.safe import (
     FileStamp,

@@ -98,7 +98,7 @@ FILES = {
     ),
     ".npz": FileKind(
         *("NumPy arrays", Holds.SMPL | Holds.POSE_SET),
-        *("files.pose_set:read_pose_set", "files.pose_set:write_pose_set"),
+        *("files.pose_set_reading:read_pose_set", "files.pose_set:write_pose_set"),
     ),
     ".json": FileKind("Poses", Holds.POSES, "bodies:read_poses", "bodies:write_poses"),
     ".safetensors": FileKind(

@@ -33,7 +33,7 @@ from lcollision_core.files import PoseSet, mesh_files
 from lcollision_core.files.mesh_file import KEEP_PRECISION
 from lcollision_core.files.motion.generated import holds_joints, is_generated
 from lcollision_core.files.motion.smpl import array_names, is_smpl_motion
-from lcollision_core.files.pose_set import natural_key
+from lcollision_core.files.pose_set_reading import natural_key
 from lcollision_core.files.scene_files import open_rigged, read_scene
 from lcollision_core.files.table import (
     POINT_CACHE_SUFFIXES,

@@ -26,7 +26,7 @@ from lcollision_core.files import (
     write_mesh,
     write_pose_set,
 )
-from lcollision_core.files.pose_set import natural_key
+from lcollision_core.files.pose_set_reading import natural_key
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import ContactRules, FaceGroup, Topology, degenerate_faces
 from tests.bending_tube import bending_tube
@@ -233,7 +233,7 @@ def test_folders_that_are_no_pose_set(tmp_path: Path) -> None:
 
 
 def test_set_beyond_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lcollision_core.files.pose_set.MAX_ITEMS", 12 * 4 * 3 - 1)
+    monkeypatch.setattr("lcollision_core.files.pose_set_reading.MAX_ITEMS", 12 * 4 * 3 - 1)
     folder = _write_folder(tmp_path)
     with pytest.raises(MeshFileError, match="12 poses of 4 vertices, more than 143"):
         read_pose_set(folder)
