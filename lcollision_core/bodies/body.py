@@ -24,7 +24,7 @@ from lcollision_core.bodies.mirror import (
     Symmetry,
     checked_mesh,
     find_symmetry,
-    require_same_faces,
+    sorted_faces,
 )
 from lcollision_core.bodies.names import (
     MAX_NAME_LENGTH,
@@ -38,7 +38,7 @@ from lcollision_core.bodies.names import (
 )
 from lcollision_core.contact import STRICT, CollisionDetector, ContactRules
 from lcollision_core.embedding.bilevel import LatentFit
-from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
+from lcollision_core.errors import LCollisionError, ModelFileError, PoseSetError, ShapeError
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.json_values import from_json, quoted
 from lcollision_core.meshes import (
@@ -623,7 +623,25 @@ class Body(ABC):
         ------
         PoseSetError : the number of vertices or faces, or the faces themselves, differ.
         """
-        require_same_faces(topology, self.topology, source, self.name)
+        needed = self.topology
+        for noun, found, count in (
+            ("vertices", topology.n_vertices, needed.n_vertices),
+            ("faces", topology.n_faces, needed.n_faces),
+        ):
+            if found != count:
+                raise PoseSetError(
+                    f"has {found} {noun}, the model {self.name!r} has {count}",
+                    "export it with the model's topology",
+                    where=source,
+                )
+        if topology != needed and not np.array_equal(
+            sorted_faces(topology.faces), sorted_faces(needed.faces)
+        ):
+            raise PoseSetError(
+                f"has other faces than the model {self.name!r}",
+                "export it with the model's topology and vertex order",
+                where=source,
+            )
 
     def edit_domains(
         self,

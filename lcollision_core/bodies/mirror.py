@@ -35,39 +35,6 @@ _UNITS = (0.001, 0.01, 0.0254, 0.1, 0.3048, 1.0)
 """Metres in a millimetre, centimetre, inch, decimetre, foot and metre."""
 
 
-def require_same_faces(topology: Topology, needed: Topology, source: str, model: str) -> None:
-    """Raise unless a mesh has the same faces as a model, in any order.
-
-    Parameters
-    ----------
-    topology : of the mesh
-    needed : of the model
-    source, model : names of the mesh and the model in the message
-
-    Raises
-    ------
-    PoseSetError : the number of vertices or faces, or the faces themselves, differ.
-    """
-    for noun, found, count in (
-        ("vertices", topology.n_vertices, needed.n_vertices),
-        ("faces", topology.n_faces, needed.n_faces),
-    ):
-        if found != count:
-            raise PoseSetError(
-                f"has {found} {noun}, the model {model!r} has {count}",
-                "export it with the model's topology",
-                where=source,
-            )
-    if topology != needed and not np.array_equal(
-        sorted_faces(topology.faces), sorted_faces(needed.faces)
-    ):
-        raise PoseSetError(
-            f"has other faces than the model {model!r}",
-            "export it with the model's topology and vertex order",
-            where=source,
-        )
-
-
 def sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     """Rotate each face so that its smallest vertex index comes first, then sort the faces."""
     turned = (np.arange(3) + faces.argmin(axis=1)[:, None]) % 3

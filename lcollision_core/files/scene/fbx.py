@@ -353,19 +353,13 @@ class FbxDocument:
         return process.returncode, output, errors
 
 
-@dataclass(frozen=True, eq=False)
-class _FbxClip:
-    """Samples an animation of a file; `parts` are the meshes that have faces."""
-
-    source: FbxDocument
-    clip: int
-    parts: tuple[int, ...]
-
-    def __call__(self, times: FloatArray) -> ScenePoses:
-        """Return the poses at (N,) times."""
-        answer = self.source.request(self.clip, times)
-        weights = tuple(answer[f"{number} weights"] for number in self.parts)
-        return ScenePoses(answer["transforms"], weights)
+def _sample(
+    source: FbxDocument, clip: int, parts: tuple[int, ...], times: FloatArray
+) -> ScenePoses:
+    """Return the poses of an animation at (N,) times; `parts` are the meshes that have faces."""
+    answer = source.request(clip, times)
+    weights = tuple(answer[f"{number} weights"] for number in parts)
+    return ScenePoses(answer["transforms"], weights)
 
 
 def _clips(source: FbxDocument, held: dict[str, Any], parts: tuple[int, ...]) -> list[Clip]:
@@ -374,8 +368,7 @@ def _clips(source: FbxDocument, held: dict[str, Any], parts: tuple[int, ...]) ->
     for number, (name, (start, end)) in enumerate(zip(names, held["spans"], strict=True)):
         key_times = partial(_frame_times, name, float(start), float(end), float(held["fps"]))
         moved = frozenset(held[f"moved {number}"].tolist())
-        sample = _FbxClip(source, number, parts)
-        clips.append(Clip(name, moved, key_times, sample))
+        clips.append(Clip(name, moved, key_times, partial(_sample, source, number, parts)))
     return clips
 
 
