@@ -145,7 +145,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self.setAcceptDrops(False)
         self.setAccessibleName("View of the body")
         self._before_paint = before_paint
-        self._painting = self.is_settled = self._shut = False
+        self._painting = self._resizing = self.is_settled = self._shut = False
         self._smoothness = Smoothness()
         self.is_smooth = False
         self.n_painted = 0
@@ -224,7 +224,7 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
 
     def paintGL(self) -> None:  # noqa: N802 - Qt's name
         """Update the scene and draw it."""
-        if self._shut:
+        if self._shut or self._resizing:
             return
         self._before_paint()
         start = time.perf_counter()
@@ -246,8 +246,10 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         self.painted.emit(seconds)
 
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
-        """Redraw at the new size."""
+        """Redraw at the new size, once the layout is done: Qt would paint here and then again."""
+        self._resizing = True
         super().resizeEvent(event)
+        self._resizing = False
         self.redraw()
 
     def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802 - Qt's name

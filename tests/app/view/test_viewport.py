@@ -242,7 +242,9 @@ class LegendWatch(QObject):
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
         layout = (QEvent.Type.Show, QEvent.Type.Hide, QEvent.Type.Resize, QEvent.Type.Move)
         if watched is not self.legend:
-            self.painting = self.painting or event.type() is QEvent.Type.Paint
+            # While Qt resizes the canvas, its paint event draws nothing.
+            is_paint = event.type() is QEvent.Type.Paint and not watched._resizing
+            self.painting = self.painting or is_paint
         elif event.type() in layout:
             (self.meanwhile if self.painting else self.otherwise).append(event.type().name)
         return False
