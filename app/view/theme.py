@@ -63,14 +63,17 @@ def wanted_theme(choice: str) -> Theme:
 
 
 def apply_theme(application: QApplication, theme: Theme) -> None:
-    """Apply a theme to the whole application; widgets get a ``changeEvent``."""
+    """Apply a theme to the whole application; widgets get a ``changeEvent`` if it is another."""
     global _current
     _current = theme
+    style_sheet = _style_sheet(theme)
+    if style_sheet == application.styleSheet():
+        return
     # Set the style by name: Qt deletes a style object made here, and PySide would then mistake
     # another object at its address for it.
     application.setStyle("Fusion")
     application.setPalette(_palette(theme))
-    application.setStyleSheet(_style_sheet(theme))
+    application.setStyleSheet(style_sheet)
 
 
 def _palette(theme: Theme) -> QPalette:
