@@ -27,6 +27,18 @@ UNPUBLISHED = {"characters", "scape", "jumping"}
 """Fixtures of data that is not redistributed: tests that use them are marked slow."""
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Collect without Python's garbage collector, and keep it from what lives as long as the tests.
+
+    Otherwise, each full collection visits all modules again.
+    """
+    gc.disable()
+    yield
+    gc.freeze()
+    gc.enable()
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark tests as slow: of unpublished data, and all but the first of `variants`."""
