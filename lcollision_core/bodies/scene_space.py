@@ -361,12 +361,15 @@ class SceneSpace:
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
-        return self._joined(
-            [
-                member.space.pull_back(codes[own], member.turned_back(by_vertices[:, rows]))
-                for member, own, rows in self._each()
-            ]
-        )
+        joined = []
+        for member, own, rows in self._each():
+            back = by_vertices[:, rows]
+            # Most contacts are within one body.
+            by_own = np.zeros((len(back), len(own)))
+            if back.any():
+                by_own = member.space.pull_back(codes[own], member.turned_back(back))
+            joined.append(by_own)
+        return self._joined(joined)
 
     def mean_slopes(
         self, weights: scipy.sparse.csr_matrix

@@ -361,10 +361,14 @@ def contact_slopes(
     """
     share = found.penetration_depth**2 / regions.squared_depth[regions.of_pair]
     deepest = np.argsort(-regions.depth, kind="stable")[:MAX_REGIONS]
-    by_vertices = np.zeros((len(regions.names), *decoded.shape))
-    faces = space.topology.faces[found.pairs]
-    add_slopes(by_vertices, regions.of_pair, faces, decoded, share, has_clearance=has_clearance)
-    return deepest, space.pull_back(codes, by_vertices[deepest])
+    row = np.full(len(regions.names), -1)
+    row[deepest] = np.arange(len(deepest))
+    of_pair = row[regions.of_pair]
+    kept = of_pair >= 0
+    by_vertices = np.zeros((len(deepest), *decoded.shape))
+    faces = space.topology.faces[found.pairs[kept]]
+    add_slopes(by_vertices, of_pair[kept], faces, decoded, share[kept], has_clearance=has_clearance)
+    return deepest, space.pull_back(codes, by_vertices)
 
 
 def move_together(
