@@ -685,8 +685,21 @@ class Body(ABC):
 
         Parameters
         ----------
+        n_poses : >= 0
         generator : such as ``np.random.default_rng(seed)``
+
+        Raises
+        ------
+        LCollisionError : there is no such number of poses, or no generator.
         """
+        if n_poses < 0:
+            raise LCollisionError.must_be("the number of poses", "at least 0", n_poses)
+        if not isinstance(generator, np.random.Generator):
+            expected = "one of NumPy, such as np.random.default_rng(0)"
+            raise LCollisionError.must_be("the generator", expected, repr(generator))
+        return self._drawn(n_poses, generator)
+
+    def _drawn(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
         return self.latent_space.sample(n_poses, generator)
 
     def with_card(self, card: ModelCard, name: str | None = None) -> Self:

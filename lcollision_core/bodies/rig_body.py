@@ -658,7 +658,7 @@ class RigBody(Body):
             units=tuple("°" if angle else " %" for angle in angles),
         )
 
-    def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
+    def _drawn(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
         """Draw (n_poses, D) human poses; the whole body stays in place."""
         if self.latent_size == ROOT_CODES:
             return np.zeros((n_poses, ROOT_CODES))

@@ -585,7 +585,7 @@ class SceneBody(Body):
             tuple(units),
         )
 
-    def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
+    def _drawn(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
         """Draw (n_poses, D) poses; each body stays in place, and fixed ones at rest."""
         poses = np.zeros((n_poses, self.latent_size))
         for member, own in zip(self.standing, self._space.codes, strict=True):

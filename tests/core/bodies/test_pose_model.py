@@ -5,6 +5,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -360,6 +361,21 @@ def test_faces_may_come_in_another_order_but_not_be_others(model: LearnedBody) -
         model.require_topology(Topology(faces[1:], model.n_vertices), "fewer.obj")
     with pytest.raises(PoseSetError, match=r"more.obj has \d+ vertices"):
         model.require_topology(Topology(faces, model.n_vertices + 1), "more.obj")
+
+
+@pytest.mark.parametrize(
+    ("n_poses", "generator", "sentence"),
+    [
+        (-1, np.random.default_rng(0), "the number of poses must be at least 0, got -1"),
+        (3, 0, "the generator must be one of NumPy, such as np.random.default_rng(0), got 0"),
+    ],
+)
+def test_what_cannot_be_sampled_is_refused_in_a_sentence(
+    model: LearnedBody, n_poses: int, generator: Any, sentence: str
+) -> None:
+    with pytest.raises(LCollisionError) as refused:
+        model.sample(n_poses, generator)
+    assert str(refused.value) == sentence
 
 
 @pytest.mark.parametrize("colliding", [True, False])
