@@ -31,7 +31,13 @@ StoreArgument = Annotated[
 
 def evaluate(
     model_name: ModelArgument,
-    store_path: StoreArgument,
+    store_path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="STORE|POSES",
+            help="Samples of the model, from `lcollision label`, or a .json file of poses.",
+        ),
+    ],
     n_rows: RowsOption = None,
     threshold: Annotated[
         float,
@@ -79,14 +85,20 @@ def evaluate(
 ) -> None:
     """Score a model's predictor against exact labels.
 
-    On the store that it was trained on, only rows that took no part in its training count; on any
-    other store of the model, every row does. MSE and RANK are in energies divided by the mean of
+    On the store that it was trained on, only held-out rows count, also when the store has grown,
+    so that predictors of fewer and of more rows are measured by the same; on any other store of the
+    model, every row does. Poses of your own are listed with their estimate and the exact check,
+    without kinds of poses. MSE and RANK are in energies divided by the mean of
     the colliding training samples.
     """
+    import numpy as np
+
     from lcollision_core.bodies import LearnedBody, score_kinds
+    from lcollision_core.files.safe import write_table
     from lcollision_core.predictor import score_rows
     from lcollision_core.tasks.changing import change_body, require_changeable
     from lcollision_core.tasks.exporting import require_output
+    from lcollision_core.tasks.inputs import read_some_poses
 
     choose_device(device, note)
     if keep and (n_rows is not None or threshold != 0.5):
@@ -98,10 +110,20 @@ def evaluate(
         require_output(samples_csv, ".csv")
     model = LearnedBody.load(model_name)
     trained = model.require_predictor()
-    store = open_store(store_path, model)
-    if keep:
-        require_changeable(model_name)
-    rows, numbers = _unseen(store, store.load(n_rows), trained)
+    of_poses = store_path.suffix.lower() == ".json"
+    numbers: Sequence[str] | npt.NDArray[np.int64]
+    if of_poses:
+        if keep or n_rows is not None:
+            what = "--keep and --rows are for label stores"
+            raise LCollisionError(what, "leave them out", where=store_path)
+        n_of_kind, poses = 0, read_some_poses(store_path, model)
+        numbers = [pose.name for pose in poses]
+        rows = model.labeller().label(np.stack([pose.latent for pose in poses]))
+    else:
+        store = open_store(store_path, model)
+        if keep:
+            require_changeable(model_name)
+        rows, numbers = _unseen(store, store.load(n_rows), trained)
     with cancellable_bar("Evaluating") as job:
         scored = score_rows(trained, rows, job=job)
     metrics = scored.metrics(threshold)
@@ -117,14 +139,23 @@ def evaluate(
 
         save_figures(scored, figure)
         note(f"saved the figures of {model.name} to {figure}")
+    samples = []
+    if of_poses or samples_csv is not None:
+        samples = _samples(scored, "pose" if of_poses else "sample", numbers, threshold)
     if samples_csv is not None:
-        _write_samples(scored, numbers, threshold, samples_csv)
+        write_table(samples_csv, samples[0], samples)
         note(f"wrote {counted(len(rows), 'sample')} to {samples_csv}")
     report = _report(scored, threshold, model.domain_names)
     if as_json:
         measured = {"colliding_share": float(rows.colliding.mean()), "threshold": threshold}
         by_kind = {"kinds": [asdict(scores) for scores in kinds]}
+        if of_poses:
+            by_kind["poses"] = samples
         print_json(measured_model(model) | measured | asdict(metrics) | by_kind | report)
+        return
+    if of_poses:
+        for line in [*_pose_lines(samples), _verdict_lines(report)[0]]:
+            tell(line)
         return
     called = "" if threshold == 0.5 else f", decision threshold {threshold:g}"
     scores = scores_text(asdict(metrics), metrics.samples)
@@ -209,15 +240,32 @@ def _part_lines(parts: Sequence[dict[str, Any]]) -> list[str]:
     return _table((head, *rows))
 
 
-def _write_samples(
-    scored: ScoredRows, numbers: npt.NDArray[np.int64], threshold: float, path: Path
-) -> None:
-    """Write each sample's labels, estimates and verdict; the file is complete or absent."""
-    from lcollision_core.files.safe import write_table
+def _pose_lines(samples: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a table of poses: the estimate, and the pairs of faces that collide."""
+    rows = [
+        (
+            pose["pose"],
+            f"{pose['probability']:.3f}",
+            ("free", "colliding")[pose["called_colliding"]],
+            str(pose["pairs"]),
+        )
+        for pose in samples
+    ]
+    return _table((("pose", "probability", "estimate", "colliding pairs"), *rows))
+
+
+def _samples(
+    scored: ScoredRows,
+    kind: str,
+    names: Sequence[str] | npt.NDArray[np.int64],
+    threshold: float,
+) -> list[dict[str, Any]]:
+    """Return each sample's name or number under its kind, its labels, estimates and verdict."""
+    import numpy as np
 
     rows, scale = scored.rows, scored.predictor.facts.energy_scale
     columns = {
-        "sample": numbers,
+        kind: names,
         "colliding": rows.colliding.astype(int),
         "pairs": rows.n_pairs,
         "energy": rows.energy,
@@ -225,8 +273,8 @@ def _write_samples(
         "probability": scored.probability,
         "predicted_energy": scored.domain_energy.clip(0.0).sum(axis=1) * scale,
     }
-    values = zip(*(column.tolist() for column in columns.values()), strict=True)
-    write_table(path, columns, (dict(zip(columns, row, strict=True)) for row in values))
+    values = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in values]
 
 
 def _with_figures(

@@ -23,7 +23,15 @@ from PIL import Image
 from app.benchmarks import predictor as timing
 from app.cli.models import measured_model_sentence
 from lcollision_core import predictor as predictors
-from lcollision_core.bodies import LearnedBody, PoseKind, find_model, learned_body, scoring
+from lcollision_core.bodies import (
+    LearnedBody,
+    NamedPose,
+    PoseKind,
+    find_model,
+    learned_body,
+    scoring,
+    write_poses,
+)
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.labels import LabelStore, is_held_out
 from lcollision_core.model_file import Section
@@ -199,6 +207,29 @@ def test_each_sample_and_all_figures_are_written_where_that_is_asked_for(
         picture = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
         blue = np.abs(picture.astype(int) - (18, 64, 133)).max(axis=1) < 40
         assert blue.sum() > 200, path.name
+
+
+def test_poses_of_ones_own_are_listed_with_their_estimates(
+    lcollision: Lcollision, trained: Path, tmp_path: Path
+) -> None:
+    model, poses, table = LearnedBody.load(trained), tmp_path / "poses.json", tmp_path / "poses.csv"
+    latents = model.sample(3, np.random.default_rng(1))
+    write_poses(poses, model, [NamedPose(f"p{n}", latent) for n, latent in enumerate(latents)])
+    report = json.loads(lcollision("evaluate", trained, poses, "--csv", table, "--json").stdout)
+    expected = model.predict(latents).collision_probability
+    rows = report["poses"]
+    assert [row["pose"] for row in rows] == ["p0", "p1", "p2"]
+    assert [row["probability"] for row in rows] == pytest.approx(expected, rel=1e-5)
+    free = model.exact_check().are_free(latents)
+    assert [row["pairs"] == 0 for row in rows] == free.tolist()
+    assert [row["colliding"] for row in rows] == (~free).astype(int).tolist()
+    assert report["samples"] == 3
+    assert report["kinds"] == []
+    assert len(table.read_text().splitlines()) == 4
+    said = lcollision("evaluate", trained, poses).stdout
+    assert [line.split()[1] for line in said.splitlines()[1:4]] == [f"{p:.3f}" for p in expected]
+    refused = refusal(lcollision, "evaluate", trained, poses, "--keep")
+    assert "--keep and --rows are for label stores" in refused
 
 
 def test_the_threshold_holds_for_the_kinds_of_poses_too(
