@@ -391,12 +391,15 @@ class LibraryPanel(QWidget):
         tags = sorted({tag for pose in self._poses for tag in pose.tags}, key=str.casefold)
         if self._tag not in tags:
             self._tag = ""
-        self._tag_menu.clear()
-        for tag in ("", *tags):
-            action = self._tag_menu.addAction(menu_text(tag) or "All poses")
-            action.setData(tag)
-            action.setCheckable(True)
-            action.setChecked(tag == self._tag)
+        if [action.data() for action in self._tag_menu.actions()] != ["", *tags]:
+            # Not each time: a chosen entry comes here while it is still in use.
+            self._tag_menu.clear()
+            for tag in ("", *tags):
+                action = self._tag_menu.addAction(menu_text(tag) or "All poses")
+                action.setData(tag)
+                action.setCheckable(True)
+        for action in self._tag_menu.actions():
+            action.setChecked(action.data() == self._tag)
         self.tags.setVisible(bool(tags))
         self.tags.setText(f"Tag: {menu_text(self._tag)}" if self._tag else "Tags")
 

@@ -361,6 +361,8 @@ def test_search_and_tags_find_poses(window: MainWindow) -> None:
     entries = {action.text(): action for action in library.tags.menu().actions()}
     assert list(entries) == ["All poses", "arms", "high && wide", "leg"]
     entries["leg"].trigger()
+    # The chosen entry is not deleted while Qt still uses it.
+    assert [text for text, action in entries.items() if action.isChecked()] == ["leg"]
     assert names_shown(window) == ["left kick", "T pose"]
     press(window, Qt.Key.Key_F, CONTROL | SHIFT)
     assert library.search.hasFocus()
