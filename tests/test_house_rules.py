@@ -10,6 +10,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
+_SENTENCES = {"say": slice(1), "say_number": slice(1, 3), "marked": slice(1)}
+_MARKED = {"ALL_LOCKED", "FEET_MOVED", "self.reason"}
+
 
 def _warn(kind: type[Warning], module: str) -> None:
     warnings.warn_explicit("it changes", kind, f"{module}.py", 1, module)
@@ -52,3 +55,21 @@ def test_the_app_asks_a_body_what_it_can_do_and_never_its_class() -> None:
         and kinds & {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}
     ]
     assert asked == []
+
+
+def test_a_catalogue_can_hold_every_sentence_that_is_said() -> None:
+    """`xgettext` sees literals only: those of `say` itself, or of constants that are marked."""
+    said = [
+        (f"{path.relative_to(ROOT)}:{node.lineno}", sentence)
+        for room in ("app", "lcollision_core")
+        for path in (ROOT / room).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in _SENTENCES
+        for sentence in node.args[_SENTENCES[getattr(node.func, "id", "")]]
+    ]
+    assert len(said) > 100
+    assert [
+        place
+        for place, sentence in said
+        if not isinstance(sentence, ast.Constant) and ast.unparse(sentence) not in _MARKED
+    ] == []

@@ -419,8 +419,8 @@ class Tasks(QObject):
         ----------
         done : called with the job's value; returns the message for the status bar
         """
-        say = self.message.emit
-        self._saving.start(f"Saving {path.name}", job, lambda value: say(done(value)))
+        tell = self.message.emit
+        self._saving.start(f"Saving {path.name}", job, lambda value: tell(done(value)))
 
     def wait_for_saves(self, seconds: float = _SAVE_SECONDS) -> None:
         """Wait until all saving has finished or failed, at most `seconds`."""

@@ -26,6 +26,7 @@ from lcollision_core.resolve import PoseResolver, ResolveOptions
 from lcollision_core.resolve.problem import ResolveProblem
 from lcollision_core.resolve.solvers import polish
 from lcollision_core.resolve.steps import LeastOverlap, bisect, slide_back
+from lcollision_core.sentences import marked, say, say_number
 
 HalfSpacesOfPose = tuple[FloatArray, FloatArray]
 """(C, D) normals and (C,) offsets that separate the contacts of one pose."""
@@ -710,12 +711,12 @@ _ROUNDED = 1.0 + 1e-4
 class Reason(StrEnum):
     """Why frames were not resolved."""
 
-    NO_JOINT = "no joint moves them apart"
-    TOO_FAR = "resolving them would exceed the largest change"
-    NOT_FOUND = "no collision-free pose was found"
-    BETWEEN = "resolving them makes in-between poses collide"
-    AS_WRITTEN = "the file format can't store the correction"
-    STOPPED = "resolving was stopped before they were free"
+    NO_JOINT = marked("no joint moves them apart")
+    TOO_FAR = marked("resolving them would exceed the largest change")
+    NOT_FOUND = marked("no collision-free pose was found")
+    BETWEEN = marked("resolving them makes in-between poses collide")
+    AS_WRITTEN = marked("the file format can't store the correction")
+    STOPPED = marked("resolving was stopped before they were free")
 
 
 @dataclass(frozen=True)
@@ -758,15 +759,30 @@ class KeptSpan:
     def sentence(self, part_names: Sequence[str]) -> str:
         """Return a sentence on the frames, the overlapping parts and the reason."""
         first, last = self.frames
-        frames = f"frame {first}" if first == last else f"frames {first} to {last}"
-        verb = "stays as it was" if first == last else "stay as they were"
-        if not self.is_original:
-            verb = "overlaps as little as was found" if first == last else "overlap as little as "
-            verb += "" if first == last else "was found"
+        ends = {"first": first, "last": last}
+        if self.is_original:
+            what = say_number(
+                1 + (first != last),
+                "frame {first} stays as it was",
+                "frames {first} to {last} stay as they were",
+                **ends,
+            )
+        else:
+            what = say_number(
+                1 + (first != last),
+                "frame {first} overlaps as little as was found",
+                "frames {first} to {last} overlap as little as was found",
+                **ends,
+            )
         if not self.parts:
-            return f"{frames} {verb}: {self.reason}"
-        named = " and ".join(dict.fromkeys(part_names[part] for part in self.parts[0]))
-        return f"{frames} {verb}: {named}, {100.0 * self.deepest:.3g} % deep; {self.reason}"
+            return say("{frames}: {reason}", frames=what, reason=say(self.reason))
+        return say(
+            "{frames}: {parts}, {depth:.3g} % deep; {reason}",
+            frames=what,
+            parts=" and ".join(dict.fromkeys(part_names[part] for part in self.parts[0])),
+            depth=100.0 * self.deepest,
+            reason=say(self.reason),
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,6 +33,7 @@ from lcollision_core.resolve.problem import (
 )
 from lcollision_core.resolve.solvers import SqpBatch, polish, solve_nlopt
 from lcollision_core.resolve.steps import LeastOverlap, Standing, fall_back, pull_back, step_towards
+from lcollision_core.sentences import joined, marked, say, say_number
 
 
 class Step(StrEnum):
@@ -133,9 +134,9 @@ _ITERATIONS_ALONE = 60
 _FAR = 0.02
 """Normalised mean displacement of a free pose beyond which a nearer one is looked for."""
 
-ALL_LOCKED = "all body parts are locked, so the pose was not changed; unlock one"
+ALL_LOCKED = marked("all body parts are locked, so the pose was not changed; unlock one")
 """The note of a result whose pose has no movable code."""
-FEET_MOVED = "the feet moved, as keeping them on the ground moves the body too far"
+FEET_MOVED = marked("the feet moved, as keeping them on the ground moves the body too far")
 
 _Tried = tuple[Step, FloatArray | None]
 """A step, and the free pose that it found or None."""
@@ -189,7 +190,7 @@ class Ladder:
         if not before.colliding:
             step = Step.UNCHANGED
         elif not problem.movable.any():
-            note = ALL_LOCKED
+            note = say(ALL_LOCKED)
         else:
             if problem.model is None:
                 self._outcome = replace(self._outcome, status="no predictor")
@@ -219,7 +220,7 @@ class Ladder:
         if self.standing is None:
             return latent, None
         lifted = self.standing.lifted(self.check, self.problem, latent)
-        return (lifted, None) if least.is_within(lifted) else (latent, FEET_MOVED)
+        return (lifted, None) if least.is_within(lifted) else (latent, say(FEET_MOVED))
 
     def _soften(
         self, found: FloatArray | None, step: Step, most: float, note: str | None
@@ -239,7 +240,7 @@ class Ladder:
         if found is not None and least.is_within(found):
             return found, step, None
         if found is not None and self._nearer is not None and least.is_within(self._nearer):
-            return self._lifted(self._nearer, least)[0], step, FEET_MOVED
+            return self._lifted(self._nearer, least)[0], step, say(FEET_MOVED)
         starts = np.where(self.problem.movable, self.free_latents, self.problem.target)
         nearest = starts[np.argsort(self.problem.distance(starts), kind="stable")]
         latent = least.find([*([] if found is None else [found]), *nearest])
@@ -247,9 +248,17 @@ class Ladder:
         if self.check.is_free(latent):
             return latent, Step.SOFT, sunk
         if found is not None:
-            kind = "pose with this clearance" if self.check.clearance > 0.0 else "free pose"
-            note = f"no {kind} was found within {100.0 * most:g} % of the body size"
-        note = "; ".join(filter(None, (note, sunk))) or None
+            note = (
+                say(
+                    "no pose with this clearance was found within {most:g} % of the body size",
+                    most=100.0 * most,
+                )
+                if self.check.clearance > 0.0
+                else say(
+                    "no free pose was found within {most:g} % of the body size", most=100.0 * most
+                )
+            )
+        note = joined([note, sunk]) or None
         is_same = np.array_equal(latent, self.problem.target)
         return latent, Step.NONE if is_same else Step.SOFT, note
 
@@ -260,7 +269,7 @@ class Ladder:
             excess, _ = problem.excess(problem.target[None])
             if excess[0] + self._margin <= 0.0:
                 return self._result(problem.target, Step.UNCHANGED, None)
-            return self._result(problem.target, Step.NONE, None, ALL_LOCKED)
+            return self._result(problem.target, Step.NONE, None, say(ALL_LOCKED))
         outcome = self._outcome = self._solve(self._margin, problem.target)
         moved = not np.array_equal(outcome.latent, problem.target)
         step = Step.NONE if not outcome.feasible else Step.SOLVER if moved else Step.UNCHANGED
@@ -362,13 +371,15 @@ class Ladder:
         """Describe what prevents a free pose; advise only what makes a known pose free."""
         known, check, movable = self.free_latents, self.check, self.problem.movable
         if len(known) == 0:
-            return "no collision-free pose is known to fall back to, so the pose still collides"
+            return say(
+                "no collision-free pose is known to fall back to, so the pose still collides"
+            )
         kept = np.where(movable, known, self.problem.target)
         if check.clearance > 0.0 and check.with_clearance(0.0).are_free(kept).any():
-            return "no pose with this clearance was found; choose a smaller one"
+            return say("no pose with this clearance was found; choose a smaller one")
         if not movable.all() and check.are_free(known).any():
-            return "no free pose was found that keeps the locked body parts; unlock one"
-        return "no pose without collisions was found"
+            return say("no free pose was found that keeps the locked body parts; unlock one")
+        return say("no pose without collisions was found")
 
     def _result(
         self,
@@ -406,7 +417,7 @@ class Ladder:
             iterations=self._outcome.iterations,
             evaluations=problem.evaluations,
             seconds=problem.deadline.seconds,
-            note="; ".join(filter(None, (self.remark, note))) or None,
+            note=joined([self.remark, note]) or None,
             clearance=self.options.clearance,
             largest_change=self.options.largest_change,
             deepest_after=after.deepest if after else None,
@@ -555,12 +566,21 @@ class PoseResolver:
             )
         target = self._checked(latent)
         outside = int(np.count_nonzero((target < self._low) | (target > self._high)))
-        # A bare rig has no trained range, and no sliders where a client poses it.
-        what, kind = ("values of the pose", "their usual range")
         if self._predictor is not None:
-            what, kind = ("sliders", "the trained range")
-        verb = "is" if outside == 1 else "are"
-        remark = f"{outside} of {len(target)} {what} {verb} outside {kind}"
+            remark = say_number(
+                outside,
+                "{n} of {all} sliders is outside the trained range",
+                "{n} of {all} sliders are outside the trained range",
+                all=len(target),
+            )
+        else:
+            # A bare rig has no trained range, and no sliders where a client poses it.
+            remark = say_number(
+                outside,
+                "{n} of {all} values of the pose is outside their usual range",
+                "{n} of {all} values of the pose are outside their usual range",
+                all=len(target),
+            )
         earlier = None if before is None or self._predictor is not None else self._checked(before)
         standing = None
         if resolve_options.standing is not None:

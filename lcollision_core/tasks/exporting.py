@@ -621,9 +621,13 @@ def write_motions(
         for motion, row in zip(motions, rows, strict=True):
             if motion.space_at is not None:
                 _count_stuck(row, body, ~check.are_free(motion.codes))
-                left_out = "{path}: pose files store rotations and weights only; other deformation "
-                left_out += "in {clip} is left out (use .glb or .pc2 to keep it)"
-                job.note(say(left_out, path=output.path, clip=motion.name))
+                left_out = say(
+                    "{path}: pose files store rotations and weights only; other deformation in "
+                    "{clip} is left out (use .glb or .pc2 to keep it)",
+                    path=output.path,
+                    clip=motion.name,
+                )
+                job.note(left_out)
 
 
 def _count_stuck(

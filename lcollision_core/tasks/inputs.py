@@ -134,16 +134,23 @@ def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None
         # Generators write joint positions beside the motion, which also has the rotations.
         files, others = [path for path in files if path not in places], places + others
     if files and others:
+        names = listed((path.relative_to(folder).as_posix() for path in others), 3)
+        fields = {"folder": folder, "names": names}
         left_out = say_number(
             len(others),
             "{folder}: skipped {names}: no motion in it",
             "{folder}: skipped {names}: no motion in them",
-            folder=folder,
-            names=listed((path.relative_to(folder).as_posix() for path in others), 3),
+            **fields,
         )
         if any(path.suffix.lower() == ".npy" for path in others):
-            advice = "{note} that can be read; save arrays by name in an .npz file"
-            left_out = say(advice, note=left_out)
+            left_out = say_number(
+                len(others),
+                "{folder}: skipped {names}: no motion in it that can be read; save arrays by name "
+                "in an .npz file",
+                "{folder}: skipped {names}: no motion in them that can be read; save arrays by "
+                "name in an .npz file",
+                **fields,
+            )
         job.note(left_out)
     return files
 

@@ -87,8 +87,10 @@ class Run(Generic[T]):
             )
         self.done.update(done)
         if done:
-            going_on = "continuing from {path}, which has {done}"
-            self._job.note(say(going_on, path=self.path, done=self._told))
+            going_on = say(
+                "continuing from {path}, which has {done}", path=self.path, done=self._told
+            )
+            self._job.note(going_on)
 
     def keep(self, name: str, item: T) -> None:
         """Add a finished item; write the file if the last write was long ago."""
@@ -102,10 +104,18 @@ class Run(Generic[T]):
         if not (self.done and self._write()):
             return
         if len(self.done) == self._total:
-            sentence = "stopped; {path} has {done}, run the command again when they can be written"
+            stopped = say(
+                "stopped; {path} has {done}, run the command again when they can be written",
+                path=self.path,
+                done=self._told,
+            )
         else:
-            sentence = "stopped; {path} has {done}, run the same command again to continue"
-        self._job.note(say(sentence, path=self.path, done=self._told))
+            stopped = say(
+                "stopped; {path} has {done}, run the same command again to continue",
+                path=self.path,
+                done=self._told,
+            )
+        self._job.note(stopped)
 
     def finish(self) -> None:
         """Remove the file, as the output is complete."""

@@ -218,8 +218,11 @@ def _detailed(
             None if mesh is None else with_detail(body, mesh, given_pose.pose, result, clearance)
         )
         if mesh is not None and detailed[-1] is None:
-            left_out = "{source}: its detail was left out, because with it the mesh would collide"
-            job.note(say(left_out, source=given_pose.source))
+            left_out = say(
+                "{source}: its detail was left out, because with it the mesh would collide",
+                source=given_pose.source,
+            )
+            job.note(left_out)
     return detailed
 
 
@@ -465,8 +468,11 @@ def resolve_one(
         run.keep(f"{first + frame}", (pose, {"free": is_free}))
 
     if options.keep_contacts and motion.contacts is not None and motion.contacts() is None:
-        no_skin = "{source} shows no body, so of its contacts only standing feet are kept"
-        job.note(say(no_skin, source=motion.source))
+        no_skin = say(
+            "{source} shows no body, so of its contacts only standing feet are kept",
+            source=motion.source,
+        )
+        job.note(no_skin)
     up = np.eye(3)[body.up_axis]
     resolution = resolve_motion(
         body.resolver,

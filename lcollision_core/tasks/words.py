@@ -1,28 +1,26 @@
 """Sentences that report results to people, and the formatting of numbers and names in them.
 
-Each sentence is complete, with named fields, and goes through `say` or `say_number`: a translation
-sets its catalogue as `CATALOGUE`, and `xgettext -k say -k say_number:2,3` collects the sentences. A
-verdict is a list of sentences joined by semicolons.
+Each sentence is complete, with named fields, and goes through `say` or `say_number`. A verdict is a
+list of sentences joined by semicolons.
 """
 
 from __future__ import annotations
 
-import gettext
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lcollision_core.errors import listed
+from lcollision_core.sentences import joined as joined
+from lcollision_core.sentences import say as say
+from lcollision_core.sentences import say_number as say_number
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import MirroredPose
     from lcollision_core.meshes import UpGuess
     from lcollision_core.resolve import ResolveResult
     from lcollision_core.tasks.verdicts import CheckedClip, CheckedMesh, PrintedFigure, ResolvedClip
-
-CATALOGUE = gettext.NullTranslations()
-"""Translations of all sentences; none by default."""
 
 _NOT_IN_A_LINE = re.compile(
     "[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
@@ -33,21 +31,6 @@ _FAR = 0.03
 
 
 _MIRRORED = " mirrored"
-
-
-def say(sentence: str, **fields: object) -> str:
-    """Return a translated sentence with its fields filled in."""
-    return CATALOGUE.gettext(sentence).format(**fields)
-
-
-def say_number(number: int, one: str, several: str, **fields: object) -> str:
-    """Return a translated sentence about a number of things, which its field `n` holds."""
-    return CATALOGUE.ngettext(one, several, number).format(n=number, **fields)
-
-
-def joined(sentences: Iterable[str | None]) -> str:
-    """Join sentences about one thing; empty ones are left out."""
-    return "; ".join(sentence for sentence in sentences if sentence)
 
 
 def overlap_text(energy: float) -> str:
@@ -118,9 +101,14 @@ def one_line(text: str) -> str:
 
 def fit_error(mean: float | None, most: float | None) -> str:
     """Describe the fit error of a mesh, normalised; None for an exact pose."""
-    mean, most = mean or 0.0, most or 0.0
-    far = ", which is large: is it this body, in the model's vertex order?" if mean > _FAR else ""
-    return f"fit error of {100.0 * mean:.3f} % of the body size, at most {100.0 * most:.2f} %{far}"
+    fields = {"mean": 100.0 * (mean or 0.0), "most": 100.0 * (most or 0.0)}
+    if (mean or 0.0) > _FAR:
+        return say(
+            "fit error of {mean:.3f} % of the body size, at most {most:.2f} %, which is large: is "
+            "it this body, in the model's vertex order?",
+            **fields,
+        )
+    return say("fit error of {mean:.3f} % of the body size, at most {most:.2f} %", **fields)
 
 
 def mirrored_name(name: str) -> str:
@@ -179,24 +167,38 @@ def up_text(guess: UpGuess) -> str:
 
 def scores_text(scores: Mapping[str, Any], n_samples: int | None = None) -> str:
     """Describe a predictor's scores, named as in `PredictorMetrics`, on samples unseen by it."""
-    return say(
-        "accuracy {accuracy:.1f} % on {n}unseen samples (majority baseline: {majority:.1f} %), "
+    fields = {
+        "accuracy": 100.0 * scores["accuracy"],
+        "majority": 100.0 * scores["majority_rate"],
+        "rates": error_rates_text(scores["false_positive_rate"], scores["false_negative_rate"]),
+    }
+    if n_samples is None:
+        return say(
+            "accuracy {accuracy:.1f} % on unseen samples (majority baseline: {majority:.1f} %), "
+            "{rates}",
+            **fields,
+        )
+    return say_number(
+        n_samples,
+        "accuracy {accuracy:.1f} % on {n} unseen sample (majority baseline: {majority:.1f} %), "
         "{rates}",
-        accuracy=100.0 * scores["accuracy"],
-        n="" if n_samples is None else f"{n_samples} ",
-        majority=100.0 * scores["majority_rate"],
-        rates=error_rates_text(scores["false_positive_rate"], scores["false_negative_rate"]),
+        "accuracy {accuracy:.1f} % on {n} unseen samples (majority baseline: {majority:.1f} %), "
+        "{rates}",
+        **fields,
     )
 
 
 def error_rates_text(false_positive: float | None, false_negative: float | None) -> str:
     """Describe a predictor's error rates; None if there were no poses to judge."""
-    sides = (
-        (false_positive, "free poses called colliding"),
-        (false_negative, "colliding poses called free"),
+    wrong, missed = (
+        say("an unknown share") if rate is None else f"{100.0 * rate:.1f} %"
+        for rate in (false_positive, false_negative)
     )
-    rates = ((None if rate is None else f"{100.0 * rate:.1f} %", what) for rate, what in sides)
-    return ", ".join(f"{rate or 'an unknown share'} of {what}" for rate, what in rates)
+    return say(
+        "{wrong} of free poses called colliding, {missed} of colliding poses called free",
+        wrong=wrong,
+        missed=missed,
+    )
 
 
 def with_capital(text: str) -> str:
@@ -286,8 +288,13 @@ def checked_mesh_text(verdict: CheckedMesh) -> str:
 
 def in_between_text(n_poses: int) -> str:
     """Describe collisions between free frames; "" for none."""
-    one = "{n} pose between free frames collides"
-    return say_number(n_poses, one, "{n} poses between free frames collide") if n_poses else ""
+    if not n_poses:
+        return ""
+    return say_number(
+        n_poses,
+        "{n} pose between free frames collides",
+        "{n} poses between free frames collide",
+    )
 
 
 def checked_clip_table(verdicts: Iterable[CheckedClip]) -> list[str]:
@@ -420,8 +427,12 @@ def resolved_pose_text(
     if has_detail:
         parts.append(say("with its detail"))
     elif fit is not None:
-        nearest = "written as the nearest model pose, {error:.2f} % of the body size off"
-        parts.append(say(nearest, error=100.0 * fit))
+        parts.append(
+            say(
+                "written as the nearest model pose, {error:.2f} % of the body size off",
+                error=100.0 * fit,
+            )
+        )
     elif result.step == Step.UNCHANGED:
         parts.append(say("unchanged"))
     if clearance > 0.0 and result.exactly_free is not None:

@@ -595,7 +595,7 @@ class OutcomeCard(Card):
             search = "The search found a pose without collisions"
         elif ran:
             search = "The search finished" if result.converged else "The search stopped early"
-        elif ALL_LOCKED in (result.note or ""):
+        elif say(ALL_LOCKED) in (result.note or ""):
             search = "No search: all body parts are locked"
         elif result.step != Step.UNCHANGED:
             search = "No search: the time limit came first"
