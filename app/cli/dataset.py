@@ -12,7 +12,7 @@ from app.cli.contacts import rules_sentence
 from app.cli.options import Axis, PoseSetArgument, refuse_given, takes_options
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options import NO_CHANGE, RuleOptions
-from lcollision_core.tasks.words import counted, up_text
+from lcollision_core.tasks.words import counted, say_number, up_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -228,10 +228,9 @@ def make(
         with progress_bar("Posing the body") as job:
             poses = make_body(kind, n_vertices=n_vertices, seed=seed, job=job)
     else:
-        why = "applies only to the built-in body"
-        refuse_given(context, ("n_vertices",), why, "leave it out")
+        refuse_given(context, ("n_vertices",), "applies only to the built-in body", "leave it out")
         if by_rig is None:
-            why += " and to poses by the rig"
+            why = "applies only to the built-in body and to poses by the rig"
             refuse_given(context, ("seed",), why, "leave it out, or add --by-rig N")
         poses = _gathered(sources, clip, fps, up, by_rig, seed, rules)
     write_pose_set(output, poses)
@@ -265,9 +264,14 @@ def _gathered(
         note(f"{sources[0]}: {remark}")
     if by_rig is not None:
         drawn = poses.provenance["sources"][-1]["by_rig"]
-        n_drawn = counted(drawn["drawn"], "pose")
-        verb = "is" if drawn["free"] == 1 else "are"
-        note(f"{drawn['free']} of {n_drawn} by the rig {verb} free of collisions")
+        note(
+            say_number(
+                drawn["free"],
+                "{n} of {poses} by the rig is free of collisions",
+                "{n} of {poses} by the rig are free of collisions",
+                poses=counted(drawn["drawn"], "pose"),
+            )
+        )
     if not (guess := poses.up).is_sure:
         note(f"{up_text(guess)}; --up x|y|z overrides it")
     return poses

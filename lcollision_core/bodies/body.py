@@ -694,9 +694,10 @@ class Body(ABC):
         """
         if n_poses < 0:
             raise LCollisionError.must_be("the number of poses", "at least 0", n_poses)
-        if not isinstance(generator, np.random.Generator):
+        given: object = generator
+        if not isinstance(given, np.random.Generator):
             expected = "one of NumPy, such as np.random.default_rng(0)"
-            raise LCollisionError.must_be("the generator", expected, repr(generator))
+            raise LCollisionError.must_be("the generator", expected, repr(given))
         return self._drawn(n_poses, generator)
 
     def _drawn(self, n_poses: int, generator: np.random.Generator) -> FloatArray:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import ShapeError, listed
 from lcollision_core.json_values import from_json, to_json
+from lcollision_core.sentences import say, say_number
 
 CHARACTER_REST_EXCLUSION = 0.02
 """Normalised length: the rest exclusion of characters, found by measurements on several."""
@@ -298,8 +299,12 @@ class ContactRules:
         return f"without {listed(self.left_out, _NAMED_PAIRS)}" if self.left_out else ""
 
     def _near_in_words(self) -> str:
-        by_limb = ", less at thin limbs" if self.near_by_limb else ""
-        return f"within {self.near_exclusion:g} along the surface{by_limb}"
+        distance = self.near_exclusion
+        if self.near_by_limb:
+            return say(
+                "within {distance:g} along the surface, less at thin limbs", distance=distance
+            )
+        return say("within {distance:g} along the surface", distance=distance)
 
     def _tolerated_in_words(self) -> str:
         """List the tolerated depths, as in "0.001 or 0.01 between Belly and Hand"."""
@@ -322,23 +327,58 @@ class ContactRules:
         groups = " or ".join((*pairs, *("parts left out",) * bool(left_out)))
         if len(self.ignored) > _NAMED_PAIRS:
             groups = f"{len(self.ignored)} ignored pairs of groups"
-        counts_text = [
-            f"{number} {'pair' if number == 1 else 'pairs'} {what}"
-            for number, what in (
-                (counts.near, self._near_in_words()),
-                (counts.rest, f"that {'touches' if counts.rest == 1 else 'touch'} at rest"),
-                (counts.ignored, f"of {groups}"),
-                (counts.tolerated, f"not deeper than {self._tolerated_in_words()}"),
-                (counts.joint, f"at {'a joint' if counts.joint == 1 else 'joints'}"),
-                (counts.touching, "at places that nearly always touch"),
-                (counts.shape, "at places that a shape brings into contact"),
-            )
-            if number
-        ]
-        if not counts_text:
+        near, depth = self._near_in_words(), self._tolerated_in_words()
+        texts = (
+            (
+                counts.near,
+                say_number(counts.near, "{n} pair {near}", "{n} pairs {near}", near=near),
+            ),
+            (
+                counts.rest,
+                say_number(
+                    counts.rest, "{n} pair that touches at rest", "{n} pairs that touch at rest"
+                ),
+            ),
+            (
+                counts.ignored,
+                say_number(
+                    counts.ignored, "{n} pair of {groups}", "{n} pairs of {groups}", groups=groups
+                ),
+            ),
+            (
+                counts.tolerated,
+                say_number(
+                    counts.tolerated,
+                    "{n} pair not deeper than {depth}",
+                    "{n} pairs not deeper than {depth}",
+                    depth=depth,
+                ),
+            ),
+            (counts.joint, say_number(counts.joint, "{n} pair at a joint", "{n} pairs at joints")),
+            (
+                counts.touching,
+                say_number(
+                    counts.touching,
+                    "{n} pair at places that nearly always touch",
+                    "{n} pairs at places that nearly always touch",
+                ),
+            ),
+            (
+                counts.shape,
+                say_number(
+                    counts.shape,
+                    "{n} pair at places that a shape brings into contact",
+                    "{n} pairs at places that a shape brings into contact",
+                ),
+            ),
+        )
+        *others, last = [text for number, text in texts if number] or [""]
+        if not last:
             return left_out
-        pairs_text = " and ".join(filter(None, [", ".join(counts_text[:-1]), counts_text[-1]]))
-        not_counted = f"{pairs_text} {'is' if counts.total == 1 else 'are'} not counted"
+        pairs_text = say("{some} and {last}", some=", ".join(others), last=last) if others else last
+        not_counted = say_number(
+            counts.total, "{pairs} is not counted", "{pairs} are not counted", pairs=pairs_text
+        )
         return ", ".join(filter(None, (left_out, not_counted)))
 
 

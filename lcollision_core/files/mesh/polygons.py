@@ -12,6 +12,7 @@ import numpy.typing as npt
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.topology import Topology
+from lcollision_core.sentences import say_number
 
 MAX_FACES = 5_000_000
 """Most faces, and most vertices, in a mesh file.
@@ -180,13 +181,18 @@ def triangulate(polygons: Polygons, topology: Topology | None = None) -> Triangu
         raise MeshFileError(
             f"has {sizes[face]} corners, three are needed", where=f"face {face} (from 0)"
         )
-    for count, name in (
-        (int((sizes == 4).sum()), "quad{}"),
-        (int((sizes > 4).sum()), "polygon{} of more than four corners"),
-    ):
-        if count:
-            were = "was" if count == 1 else "were"
-            notes.append(f"{count} {name.format('s' * (count > 1))} {were} triangulated")
+    if n_quads := int((sizes == 4).sum()):
+        notes.append(
+            say_number(n_quads, "{n} quad was triangulated", "{n} quads were triangulated")
+        )
+    if n_larger := int((sizes > 4).sum()):
+        notes.append(
+            say_number(
+                n_larger,
+                "{n} polygon of more than four corners was triangulated",
+                "{n} polygons of more than four corners were triangulated",
+            )
+        )
     polygon_of = np.repeat(np.arange(len(sizes)), sizes - 2)
     first = (np.cumsum(sizes) - sizes)[polygon_of]
     # Each earlier polygon has two more corners than triangles.
