@@ -279,4 +279,5 @@ def take_picture(window: QWidget, name: str) -> None:
     area = QRect(corner, window.size())
     picture = QGuiApplication.primaryScreen().grabWindow(0, *area.getRect())
     assert not picture.isNull()
-    assert picture.save(str(SHOTS / f"{name}.png"))
+    # Compressing more takes several times as long.
+    assert picture.save(str(SHOTS / f"{name}.png"), quality=85)
