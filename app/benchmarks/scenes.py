@@ -21,7 +21,6 @@ import numpy as np
 import numpy.typing as npt
 
 from app.benchmarks.measures import Row
-from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.remembered import open_character
 from lcollision_core.bodies.rig_poses import POSES, PoseTable, starter_poses
 from lcollision_core.bodies.scene_body import SceneBody, SceneFile, ScenePart
@@ -49,10 +48,8 @@ class _Actor:
     """A character with poses, measured along left, up and front in heights of its rest pose."""
 
     def __init__(self, file: Path) -> None:
-        self.file, body = file, open_character(file)
-        if not isinstance(body, RigBody) or body.joints is None:
-            raise LCollisionError("has no rig", "name a rigged character", where=file)
-        self.body, self.space = body, body.space
+        self.file, self.body = file, open_character(file)
+        self.space = self.body.space
         tables = POSES, bundled_table("scene_poses.toml", PoseTable)
         self.codes: Mapping[str, FloatArray] = {
             pose.name: pose.codes for table in tables for pose in starter_poses(self.space, table)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from lcollision_core.bodies import LearnedBody, sample_poses
 from lcollision_core.embedding.training_run import EmbeddingConfig
@@ -157,7 +158,9 @@ def test_a_run_that_is_killed_goes_on_to_the_same_model(
 ) -> None:
     work = work_in(tmp_path, request_for_tube, "killed")
     for stage in (Stage.LATENT_SPACE, Stage.PREDICTOR):
-        process = subprocess.Popen([sys.executable, "-c", _KILLED, work.destination, stage])
+        # Sums of several threads differ, and earlier tests may have set their number.
+        code = f"import torch; torch.set_num_threads({torch.get_num_threads()})\n{_KILLED}"
+        process = subprocess.Popen([sys.executable, "-c", code, work.destination, stage])
         give_up = time.monotonic() + 600.0
         while work.status.stage != stage and process.poll() is None:
             assert time.monotonic() < give_up, f"{stage} has not begun"
