@@ -146,7 +146,9 @@ def test_a_trained_predictor_is_measured_on_real_labels(
     called = counts["true_positives"] + counts["false_positives"]
     assert report["precision"] == counts["true_positives"] / called
     for name, (low, high) in intervals.items():
-        assert low < report[name] < high, name
+        # The interval of a rate of 0 or 1 ends there.
+        assert low < report[name] or low == report[name] == 0.0, name
+        assert report[name] < high or report[name] == high == 1.0, name
     names = list(LearnedBody.load(trained).domain_names)
     assert [part["part"] for part in parts] == names
     assert all(part["auc"] > 0.6 for part in parts)
