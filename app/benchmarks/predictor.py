@@ -44,7 +44,7 @@ import numpy.typing as npt
 from app.benchmarks.detection import contacts_of_fcl, missing_peers
 from app.benchmarks.measures import Row, median_seconds
 from lcollision_core.bodies import LearnedBody, check_poses
-from lcollision_core.embedding import ROWS_PER_BLOCK
+from lcollision_core.embedding.bilevel import ROWS_PER_BLOCK
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.predictor import CollisionPredictor
 

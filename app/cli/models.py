@@ -70,23 +70,27 @@ def info(
         ),
     ] = None,
 ) -> None:
-    """Show what a model, a character or a scene contains and how exact it is.
+    """Show what a model, a character, a scene or a label store contains, and how exact a model is.
 
     Lengths are normalised.
     """
-    from lcollision_core.bodies.scene_file import open_any
+    from lcollision_core.tasks.opening import open_any
 
     if figure is not None:
         from lcollision_core.tasks.exporting import require_output
 
         require_output(figure, ".png")
-    learning = _being_learned(model_name)
-    if learning is not None and figure is None:
-        if as_json:
-            print_json(learning)
-        else:
-            tell(_learning_sentence(learning))
-        return
+    for describe_other, sentence in (
+        (_being_learned, _learning_sentence),
+        (_label_store, _label_store_sentence),
+    ):
+        other = None if figure is not None else describe_other(model_name)
+        if other is not None:
+            if as_json:
+                print_json(other)
+            else:
+                tell(sentence(other))
+            return
     model = open_any(model_name)
     report = describe(model)
     if figure is not None:
@@ -113,16 +117,20 @@ def info(
 
 def _being_learned(name_or_path: str) -> dict[str, Any] | None:
     """Return the progress of a model that `lcollision new` has begun, else None."""
-    from lcollision_core.bodies import user_models_folder
+    from lcollision_core.bodies.learned_body import user_models_folder, work_path
     from lcollision_core.files.table import MODEL_SUFFIX
-    from lcollision_core.tasks.work_folder import WorkFolder
 
     path = Path(name_or_path)
     if len(path.parts) <= 1 and path.suffix != MODEL_SUFFIX:
         path = user_models_folder() / f"{path}{MODEL_SUFFIX}"
-    work = WorkFolder(path)
-    if path.exists() or not work.path.is_dir():
+    try:
+        if path.exists() or not work_path(path).is_dir():
+            return None
+    except OSError:  # In a folder that cannot be read, nothing is being learned.
         return None
+    from lcollision_core.tasks.work_folder import WorkFolder
+
+    work = WorkFolder(path)
     status, running = asdict(work.status), work.is_locked
     return {"name": work.name, "learning": {**status, "running": running}}
 
@@ -139,6 +147,44 @@ def _learning_sentence(report: dict[str, Any]) -> str:
     why = f": {status['sentence']}" if status["sentence"] else ""
     again = "run its command again to continue"
     return f"{report['name']}: its learning stopped at {stage}, {share}{why}; {again}"
+
+
+def _label_store(path: str) -> dict[str, Any] | None:
+    """Return the content of a label store; None if the path is not that of one."""
+    if not Path(path).is_dir():
+        return None
+    import numpy as np
+
+    from lcollision_core.bodies.learned_body import find_latent_space
+    from lcollision_core.labels.labeller import measures
+    from lcollision_core.labels.store import MANIFEST, LabelStore
+
+    if not (Path(path) / MANIFEST).is_file():
+        return None
+    store = LabelStore.open(path)
+    identity, n_rows = store.identity, store.n_rows
+    model = find_latent_space(identity.model)
+    return {
+        "store": path,
+        "model": None if model is None else model.name,
+        "fingerprint": identity.model,
+        "rows": n_rows,
+        "held_out": int(measures(np.arange(n_rows), identity.draws).sum()),
+        "seed": identity.seed,
+        "draws": identity.draws.value,
+        "rules": identity.rules.to_json(),
+    }
+
+
+def _label_store_sentence(report: dict[str, Any]) -> str:
+    """Describe the content of a label store."""
+    rows, held_out = report["rows"], report["held_out"]
+    model = report["model"] or f"a model that is not listed ({report['fingerprint']})"
+    return (
+        f"{report['store']}: a label store that `lcollision label` made, {counted(rows, 'row')} of "
+        f"{model} ({report['draws']}, seed {report['seed']}), {held_out} of them "
+        f"({100.0 * held_out / max(rows, 1):.0f} %) held out to measure a predictor"
+    )
 
 
 def domains(
@@ -315,6 +361,7 @@ def _describe_predictor(model: Body) -> dict[str, Any] | None:
     metrics = None if record.metrics is None else asdict(record.metrics)
     return {
         "preset": record.config.preset,
+        "described": record.config.described,
         "training": asdict(record.config),
         "rows": facts.rows,
         "colliding_share": facts.colliding_share,
@@ -327,13 +374,10 @@ def _describe_predictor(model: Body) -> dict[str, Any] | None:
 
 def _predictor_sentence(report: dict[str, Any]) -> str:
     """Describe the predictor in a report of `describe`."""
-    from lcollision_core.predictor import PredictorConfig
-
     predictor = report["predictor"]
     if predictor is None:
         return "no predictor yet; `lcollision label` and `lcollision train predictor` add one"
-    metrics = predictor["metrics"]
-    described = PredictorConfig(**predictor["training"]).described
+    metrics, described = predictor["metrics"], predictor["described"]
     if metrics is None:
         return f"predictor {described}, not measured"
     scores, n_rows = scores_text(metrics), predictor["rows"]

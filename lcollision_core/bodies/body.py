@@ -36,12 +36,12 @@ from lcollision_core.bodies.names import (
     code_names,
     with_regions,
 )
-from lcollision_core.contact import STRICT, CollisionDetector, ContactRules
-from lcollision_core.embedding.bilevel import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError, PoseSetError, ShapeError
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.json_values import from_json, quoted
 from lcollision_core.meshes import (
+    STRICT,
+    ContactRules,
     FaceGroup,
     RigidTransform,
     Topology,
@@ -60,7 +60,8 @@ from lcollision_core.meshes.topology import FloatArray, array_of
 if TYPE_CHECKING:
     from lcollision_core.bodies.rig_poses import StarterPose
     from lcollision_core.bodies.rig_space import RigPoseSpace
-    from lcollision_core.embedding.bilevel import Embedding
+    from lcollision_core.contact import CollisionDetector
+    from lcollision_core.embedding.bilevel import Embedding, LatentFit
     from lcollision_core.files.character import Character
     from lcollision_core.files.scene.appearance import Appearance
     from lcollision_core.options import RuleOptions
@@ -899,6 +900,8 @@ class Body(ABC):
     @cached_property
     def detector(self) -> CollisionDetector:
         """Finds exact self-collisions of this model's meshes, in the data's unit."""
+        from lcollision_core.contact import CollisionDetector
+
         return CollisionDetector(self.topology, self.reference, self.rules, self.groups)
 
     @property

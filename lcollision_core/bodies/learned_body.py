@@ -25,9 +25,8 @@ from lcollision_core.bodies.names import (
 from lcollision_core.bundled import bundled_folder, user_folder
 from lcollision_core.embedding.bilevel import BOX_ARRAYS, Embedding, LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
-from lcollision_core.files import (
+from lcollision_core.files.safe import (
     FileStamp,
-    PoseSet,
     file_stamp,
     has_known_suffix,
     locked,
@@ -49,6 +48,7 @@ from lcollision_core.model_file import (
 from lcollision_core.options import SampleDistribution
 
 if TYPE_CHECKING:
+    from lcollision_core.files import PoseSet
     from lcollision_core.files.scene.appearance import Appearance
     from lcollision_core.labels import Labeller
     from lcollision_core.posing import LatentPoseSpace
@@ -390,7 +390,7 @@ class LearnedBody(Body):
     @cached_property
     def space(self) -> LatentPoseSpace:
         """The pose space of latent codes, which dragging and Resolve use."""
-        from lcollision_core.posing import LatentPoseSpace
+        from lcollision_core.posing.pose_space import LatentPoseSpace
 
         return LatentPoseSpace(self.embedding)
 
@@ -482,7 +482,7 @@ class LearnedBody(Body):
         section = self._other_sections.get(_PREDICTOR)
         if section is None:
             return None
-        from lcollision_core.predictor import PredictorRecord
+        from lcollision_core.predictor.predictor import PredictorRecord
 
         return PredictorRecord.of_section(section, self.embedding)
 

@@ -13,17 +13,17 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import PoseSetError, ShapeError, WrongScaleError
-from lcollision_core.files.mesh_file import can_hold, first_not_finite, in_unit
 from lcollision_core.files.scene.transforms import from_rotation_vectors
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform, Topology, body_size
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.outliers import LARGEST_SIZE, is_torn, scale_of
+from lcollision_core.meshes.precision import can_hold, first_not_finite, in_unit
 from lcollision_core.meshes.topology import FloatArray
 
 if TYPE_CHECKING:
+    from lcollision_core.bodies.rig_space import RigPoseSpace
     from lcollision_core.posing import ExactCheck, Pin
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 

@@ -190,11 +190,6 @@ def beside(scene: SceneFile, file: Path) -> SceneFile:
     return replace(scene, bodies=(*scene.bodies, ScenePart(str(file), at=at)))
 
 
-def open_any(source: str | os.PathLike[str]) -> Body:
-    """Read a body, or a scene of several: see `open_body` and `open_scene_file`."""
-    return open_scene_file(source) if is_scene_file(source) else open_body(source)
-
-
 def _place(part: ScenePart, body: Body, first: Body) -> RigidTransform:
     """Return the transform from a body's coordinates to the scene's."""
     turn = np.eye(3)

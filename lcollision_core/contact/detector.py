@@ -50,11 +50,11 @@ from lcollision_core.contact.search import (
 )
 from lcollision_core.devices import uses_gpu
 from lcollision_core.errors import ShapeError
-from lcollision_core.files.mesh_file import can_hold, first_not_finite
 from lcollision_core.jobs import UNWATCHED, Job, available_cores, for_blocks
 from lcollision_core.meshes.contact_rules import N_RULES, STRICT, ContactRules, RuleCounts
 from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.face_groups import FaceGroup
+from lcollision_core.meshes.precision import can_hold, first_not_finite
 from lcollision_core.meshes.topology import Topology
 
 if TYPE_CHECKING:

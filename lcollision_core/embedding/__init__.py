@@ -1,13 +1,10 @@
 """The latent space of poses: bilevel autoencoder, attention masks, stage 1 of the training."""
 
-from lcollision_core.embedding.bilevel import (
-    ROWS_PER_BLOCK,
-    Embedding,
-    EmbeddingMetrics,
-    LatentBox,
-    LatentFit,
-)
-from lcollision_core.embedding.decoder import AutoencoderWeights, FeatureDecoder
-from lcollision_core.embedding.seeding import MaskQuality, attention_mask, judge_masks
-from lcollision_core.embedding.training import train_embedding
-from lcollision_core.embedding.training_run import EmbeddingConfig, TrainingStatus
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lcollision_core.embedding.public import *  # noqa: F403
+else:
+    from lcollision_core.lazy import public_names
+
+    __getattr__ = public_names(__name__)

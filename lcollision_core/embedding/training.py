@@ -32,11 +32,11 @@ from lcollision_core.embedding.training_run import (
     run_key,
 )
 from lcollision_core.errors import PoseSetError
-from lcollision_core.files.mesh_file import can_hold
 from lcollision_core.files.pose_set import PoseSet
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes.alignment import align_rigid
 from lcollision_core.meshes.extents import body_size
+from lcollision_core.meshes.precision import can_hold
 from lcollision_core.meshes.topology import FloatArray
 
 _JACOBIAN_BYTES = 2_000_000_000

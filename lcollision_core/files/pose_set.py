@@ -14,9 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, PoseSetError, ShapeError
-from lcollision_core.files.mesh_file import (
-    in_unit,
-)
 from lcollision_core.files.safe import MAX_ITEMS, atomic_write, write_npz
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import parse_json
@@ -33,6 +30,7 @@ from lcollision_core.meshes.face_groups import (
     require_groups,
     runs_to_faces,
 )
+from lcollision_core.meshes.precision import in_unit
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 Arrays = Mapping[str, npt.NDArray[Any]]

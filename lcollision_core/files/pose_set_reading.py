@@ -16,11 +16,9 @@ import numpy.typing as npt
 from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError, listed
 from lcollision_core.files.mesh_file import (
     KEEP_PRECISION,
-    LARGEST_COORDINATE,
     Mesh,
     audit_mesh,
     coarseness_of,
-    first_not_finite,
     read_mesh,
 )
 from lcollision_core.files.motion.caches import cache_rate, read_point_cache
@@ -51,6 +49,7 @@ from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION, Conta
 from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.joint_kinds import joint_labels, part_labels
 from lcollision_core.meshes.outliers import LARGEST_SIZE, is_torn, outlier_poses, scale_of
+from lcollision_core.meshes.precision import LARGEST_COORDINATE, first_not_finite
 from lcollision_core.meshes.topology import FloatArray, Topology, degenerate_faces
 
 _FRAME_RULES = ContactRules(rest_exclusion=CHARACTER_REST_EXCLUSION)

@@ -20,7 +20,6 @@ from lcollision_core.files.mesh_file import (
     Mesh,
     as_stored,
     audit_mesh,
-    can_hold,
     read_mesh,
     write_mesh,
 )
@@ -43,3 +42,4 @@ from lcollision_core.files.safe import (
     require_writable,
     unused_name,
 )
+from lcollision_core.meshes.precision import can_hold

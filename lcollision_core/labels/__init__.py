@@ -1,12 +1,10 @@
 """Exact labels of samples of the latent box, and the folder that stores them."""
 
-from lcollision_core.labels.labeller import (
-    Labeller,
-    LabelRows,
-    StoreIdentity,
-    is_held_out,
-    is_of_box,
-    measures,
-)
-from lcollision_core.labels.labelling_run import LabelStatus, label_poses
-from lcollision_core.labels.store import ROWS_PER_CHUNK, LabelStore
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lcollision_core.labels.public import *  # noqa: F403
+else:
+    from lcollision_core.lazy import public_names
+
+    __getattr__ = public_names(__name__)

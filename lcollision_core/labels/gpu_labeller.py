@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.contact.kernels import COUNTED
-from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.gpu_decoder import GpuDecoder
 from lcollision_core.on_gpu import GPU_LOCK, THREADS, Buffers, blocks_for, cuda
 

@@ -11,15 +11,19 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.compiled import compiled, compiled_part
-from lcollision_core.contact import STRICT, CollisionDetector, ContactRules
 from lcollision_core.devices import uses_gpu
-from lcollision_core.embedding import ROWS_PER_BLOCK, Embedding, LatentBox
-from lcollision_core.embedding.bilevel import numbers_of
-from lcollision_core.meshes import FaceGroup
+from lcollision_core.embedding.bilevel import (
+    ROWS_PER_BLOCK,
+    Embedding,
+    LatentBox,
+    numbers_of,
+)
+from lcollision_core.meshes import STRICT, ContactRules, FaceGroup
 from lcollision_core.meshes.face_groups import ignored_faces_digest
 from lcollision_core.options import SampleDistribution
 
 if TYPE_CHECKING:
+    from lcollision_core.contact import CollisionDetector
     from lcollision_core.labels.gpu_labeller import GpuLabeller
 
 BOX_ROWS = 16
@@ -145,6 +149,8 @@ class Labeller:
     @cached_property
     def detector(self) -> CollisionDetector:
         """The exact check, in the data's unit."""
+        from lcollision_core.contact import CollisionDetector
+
         return CollisionDetector(
             self.embedding.topology,
             self.embedding.rest_vertices * self.body_size,

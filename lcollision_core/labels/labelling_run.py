@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from lcollision_core.devices import block_size
-from lcollision_core.embedding import ROWS_PER_BLOCK
+from lcollision_core.embedding.bilevel import ROWS_PER_BLOCK
 from lcollision_core.errors import LabelStoreError, LCollisionError, MissingExtraError
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.labels.labeller import Labeller, LabelRows, StoreIdentity, blocks_of

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.embedding import ROWS_PER_BLOCK
+from lcollision_core.embedding.bilevel import ROWS_PER_BLOCK
 from lcollision_core.errors import LabelStoreError, LCollisionError
 from lcollision_core.files.safe import atomic_files, atomic_write, read_npz, read_regular
 from lcollision_core.jobs import UNWATCHED, Job

@@ -1,22 +1,10 @@
 """Pose by hand: spaces of poses, grips and pins, drags that stay collision-free."""
 
-from lcollision_core.posing.dragger import (
-    GRIP_RADIUS,
-    LARGEST_RADIUS,
-    LEAST_RADIUS,
-    DragOptions,
-    DragStep,
-    Grip,
-    Pin,
-    PoseDragger,
-    Twist,
-    make_grip,
-)
-from lcollision_core.posing.exact import ExactCheck, exported_vertices
-from lcollision_core.posing.pose_space import (
-    LatentPoseSpace,
-    PoseSpace,
-    far_end,
-    frame_round,
-    long_axis,
-)
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lcollision_core.posing.public import *  # noqa: F403
+else:
+    from lcollision_core.lazy import public_names
+
+    __getattr__ = public_names(__name__)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.meshes.limbs import Limbs, far_apart
 from lcollision_core.meshes.topology import FloatArray, Topology, length_graph
 

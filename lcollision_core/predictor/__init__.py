@@ -1,20 +1,10 @@
 """Predict energies per domain and collision probability from latent codes (stage 2)."""
 
-from lcollision_core.predictor.config import (
-    PRESETS,
-    Loss,
-    PredictorConfig,
-    PredictorStatus,
-    has_begun,
-    held_out_index,
-    patches_path,
-)
-from lcollision_core.predictor.evaluation import PartScores, ScoredRows, score_rows
-from lcollision_core.predictor.metrics import CalibrationBin, Counts, KindScores, PredictorMetrics
-from lcollision_core.predictor.predictor import (
-    CollisionPredictor,
-    Prediction,
-    PredictorRecord,
-    TrainingFacts,
-)
-from lcollision_core.predictor.training import train_predictor
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lcollision_core.predictor.public import *  # noqa: F403
+else:
+    from lcollision_core.lazy import public_names
+
+    __getattr__ = public_names(__name__)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import scipy
 
 from lcollision_core.acap.features import N_FEATURES
-from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.seeding import bridged_edges
 from lcollision_core.jobs import for_blocks
 from lcollision_core.meshes.normals import vertex_normals

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError, listed
-from lcollision_core.labels import measures
+from lcollision_core.labels.labeller import measures
 from lcollision_core.options import Limits, SampleDistribution, require_limits
 
 Loss = Literal["full", "no-rank", "no-depth", "entropy"]

@@ -27,7 +27,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, silu, smooth_l
 
 from lcollision_core.contact import STRICT, CollisionDetector, ContactRules
 from lcollision_core.devices import has_gpu_kernels
-from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import for_blocks
 from lcollision_core.meshes import FaceGroup

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.labels import LabelRows
 from lcollision_core.meshes import STRICT, ContactRules, FaceGroup
 from lcollision_core.predictor.config import PredictorConfig

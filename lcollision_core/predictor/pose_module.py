@@ -9,7 +9,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from lcollision_core.acap.codec import BLOCK_POSES
-from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import for_blocks
 from lcollision_core.predictor.predictor import CollisionPredictor

@@ -13,10 +13,10 @@ import scipy
 from msgspec import Meta
 
 from lcollision_core.devices import has_gpu_kernels
-from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.json_values import from_json, quoted
-from lcollision_core.labels import LabelRows, StoreIdentity
+from lcollision_core.labels.labeller import LabelRows, StoreIdentity
 from lcollision_core.meshes.topology import FloatArray, array_of
 from lcollision_core.model_file import Section
 from lcollision_core.predictor.compiled_network import CompiledNetwork

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.acap.features import N_FEATURES
-from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.model_file import required_array
 from lcollision_core.predictor.kernels import UNITS
 

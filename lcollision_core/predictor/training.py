@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.errors import LabelStoreError
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.labels import LabelRows, StoreIdentity, is_of_box

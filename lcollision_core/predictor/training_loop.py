@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel
 
-from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.training_run import Checkpoint, run_key
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks

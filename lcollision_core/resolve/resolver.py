@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact import SelfCollisions
-from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes import RigidTransform

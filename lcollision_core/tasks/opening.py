@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from lcollision_core.errors import MeshFileError, ModelFileError, PoseSetError, WrongScaleError
-from lcollision_core.files.table import SCENE_SUFFIXES
+from lcollision_core.files.table import MODEL_SUFFIX, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import MotionChoice
 
@@ -20,6 +20,26 @@ if TYPE_CHECKING:
 
     FileContent: TypeAlias = "SceneDocument | Character | AnimationAlone | OtherMesh | None"
     """The contents of a file; None for a mesh of the open body."""
+
+
+def open_any(source: str | Path) -> Body:
+    """Read a body, or a scene of several: see `open_body` and `open_scene_file`.
+
+    Only the kind of body that it is gets imported.
+    """
+    suffix = Path(source).suffix.lower()
+    if suffix in ("", MODEL_SUFFIX):
+        from lcollision_core.bodies.learned_body import LearnedBody
+
+        return LearnedBody.load(source)
+    if suffix == ".json":
+        from lcollision_core.bodies.scene_file import is_scene_file, open_scene_file
+
+        if is_scene_file(source):
+            return open_scene_file(source)
+    from lcollision_core.bodies.remembered import open_body
+
+    return open_body(source)
 
 
 @dataclass(frozen=True, eq=False)

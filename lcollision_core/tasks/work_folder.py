@@ -14,11 +14,15 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from lcollision_core.bodies import LearnedBody, list_models, user_models_folder
-from lcollision_core.bodies.learned_body import WORK_SUFFIX, work_path
+from lcollision_core.bodies.learned_body import (
+    WORK_SUFFIX,
+    LearnedBody,
+    list_models,
+    user_models_folder,
+    work_path,
+)
 from lcollision_core.errors import FileLockedError, LCollisionError, MeshFileError, ModelFileError
-from lcollision_core.files import file_stamp, locked
-from lcollision_core.files.safe import read_regular, write_bytes
+from lcollision_core.files.safe import file_stamp, locked, read_regular, write_bytes
 from lcollision_core.files.table import MODEL_SUFFIX
 from lcollision_core.json_values import from_json, parse_json, to_json
 from lcollision_core.learning_state import LearningStatus, RunState, Stage

@@ -10,6 +10,7 @@ import pytest
 
 from tests.app.cli.commands_page import page
 from tests.app.support import Lcollision
+from tests.small_models import DATA
 
 
 def _loaded_modules(code: str) -> set[str]:
@@ -60,6 +61,17 @@ def test_info_of_a_model_loads_neither_a_compiler_nor_a_part_of_scipy() -> None:
     assert "lcollision_core.bodies" in loaded
     parts = {"scipy.sparse", "scipy.spatial", "scipy.linalg", "scipy.special"}
     assert loaded & (parts | HEAVY - {"numpy", "scipy"}) == set()
+    others = {"bodies.rig_body", "posing.dragger", "contact.detector", "files.mesh_file", "motion"}
+    assert loaded & {f"lcollision_core.{name}" for name in others} == set()
+
+
+def test_info_of_a_character_loads_no_solver_and_no_network() -> None:
+    words = ["info", str(DATA / "swing.glb")]
+    loaded = _loaded_modules(f"from app.cli.main import app\napp({words!r}, standalone_mode=False)")
+    assert "lcollision_core.bodies.rig_body" in loaded
+    others = {"motion", "resolve", "predictor.predictor", "bodies.export", "posing.dragger"}
+    assert loaded & {f"lcollision_core.{name}" for name in others} == set()
+    assert "torch" not in loaded
 
 
 def test_the_page_of_commands_is_what_help_says() -> None:

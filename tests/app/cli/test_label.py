@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import LearnedBody
-from lcollision_core.contact import RuleCounts
+from lcollision_core.contact import ContactRules, RuleCounts
 from lcollision_core.embedding.training import train_embedding
 from lcollision_core.embedding.training_run import EmbeddingConfig
 from lcollision_core.labels import ROWS_PER_CHUNK, LabelStore
@@ -93,6 +93,36 @@ def test_json_is_one_document_and_a_second_run_has_nothing_to_do(
             "excluded_at_rest": RuleCounts().to_json(),
         }
         assert result.stderr == ""
+
+
+def test_info_says_what_a_label_store_is(
+    lcollision: Lcollision, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = tmp_path / "store"
+    order = ("label", model, "-n", 320, "-o", store, "--draws", "mixed", "--seed", 3)
+    assert lcollision(*order).exit_code == 0
+    report = json.loads(lcollision("info", store, "--json").stdout)
+    fingerprint = LearnedBody.load(model).fingerprint
+    # Half of mixed samples are of the box; the last three of ten of these are held out.
+    n_held_out = sum(index % 10 >= 7 and index % 32 < 16 for index in range(320))
+    assert report == {
+        "store": str(store),
+        "model": None,
+        "fingerprint": fingerprint,
+        "rows": 320,
+        "held_out": n_held_out,
+        "seed": 3,
+        "draws": "mixed",
+        "rules": ContactRules().to_json(),
+    }
+    said = lcollision("info", store).stdout
+    assert "a label store that `lcollision label` made, 320 rows of a model that is not" in said
+    assert f"{n_held_out} of them (15 %) held out" in said
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    models = tmp_path / "data" / "lcollision" / "models"
+    models.mkdir(parents=True)
+    shutil.copy(model, models / "mine.safetensors")
+    assert "320 rows of mine (mixed, seed 3)" in lcollision("info", store).stdout
 
 
 def test_fewer_than_there_are_takes_none_away(

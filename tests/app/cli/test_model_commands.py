@@ -40,6 +40,7 @@ from tests.bending_tube import LENGTH_IN_FILES, bending_tube
 from tests.core.killed import after_checkpoint
 from tests.core.shapes import random_rotation
 from tests.rigged_shapes import head_in_torso, rigged_body, write_gltf
+from tests.small_models import DATA
 
 TRAINING = ("--domains", "2", "--domain-codes", "3", "--seed", "1", "--licence", "CC0-1.0")
 
@@ -75,6 +76,17 @@ def user_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Hide the models of the user who runs the tests."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     return tmp_path / "data" / "lcollision" / "models"
+
+
+def test_info_of_a_character_needs_no_folder_of_models(
+    lcollision: Lcollision, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The name is too long for a file system: like a locked folder, it cannot even be looked at.
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / ("x" * 300)))
+    monkeypatch.chdir(DATA)
+    result = lcollision("info", "swing.glb")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith("swing: 848 vertices")
 
 
 def test_info_prints_what_scripts_read(lcollision: Lcollision, tube: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from lcollision_core.bodies import open_body
 from lcollision_core.bodies.motions import read_motions
-from lcollision_core.bodies.scene_file import open_any
+from lcollision_core.tasks.opening import open_any
 from tests.app.support import Lcollision
 from tests.rigged_shapes import rigged_body, write_gltf
 from tests.skeletons import PERSON, character_from

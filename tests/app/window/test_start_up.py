@@ -32,7 +32,8 @@ def test_nothing_that_is_compiled_is_loaded_before_there_is_a_window() -> None:
 
 
 def test_a_body_is_opened_without_what_only_learning_and_statistics_need() -> None:
-    assert not loaded_with("lcollision_core.bodies", "torch", "scipy.stats", "scipy.optimize")
+    bodies = "lcollision_core.bodies.public"
+    assert not loaded_with(bodies, "torch", "scipy.stats", "scipy.optimize")
 
 
 def loaded_with(imported: str, *modules: str) -> set[str]:

@@ -14,7 +14,6 @@ from lcollision_core.bodies import NamedPose, open_body
 from lcollision_core.bodies.scene_body import SceneBody, SceneFile, ScenePart
 from lcollision_core.bodies.scene_file import (
     body_of_scene,
-    open_any,
     open_scene_file,
     write_scene_file,
 )
@@ -23,6 +22,7 @@ from lcollision_core.files import write_mesh
 from lcollision_core.options import ExportRequest, ResolveOptions
 from lcollision_core.posing import DragOptions, Grip
 from lcollision_core.tasks.exporting import write_members
+from lcollision_core.tasks.opening import open_any
 from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import FloatArray, rigged_body, write_gltf
 from tests.small_models import DATA
