@@ -17,9 +17,9 @@ from lcollision_core.files import Mesh, read_mesh, read_pose_set, write_mesh
 from lcollision_core.files.mesh import obj
 from lcollision_core.files.mesh.polygons import first_at_each_position
 from lcollision_core.files.mesh.text import number_rows, points
-from lcollision_core.files.mesh_file import can_hold
 from lcollision_core.files.table import WRITABLE_SUFFIXES
 from lcollision_core.meshes import Topology
+from lcollision_core.meshes.precision import can_hold
 from tests.core.background import peak_memory
 
 # One file per test function: Hypothesis overwrites it with every example.
