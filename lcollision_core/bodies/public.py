@@ -76,6 +76,3 @@ from lcollision_core.bodies.scoring import (
     score_kinds,
 )
 from lcollision_core.options import ExportAxes, ExportRequest
-
-LearnedBody = LearnedBody
-"""The name of `LearnedBody` in the examples."""
