@@ -29,7 +29,7 @@ from lcollision_core.acap.features import (
 from lcollision_core.acap.rotations import component_roots, consistent_logarithms, split_gradients
 from lcollision_core.compiled import compiled, compiled_part, inlined
 from lcollision_core.errors import ShapeError
-from lcollision_core.jobs import for_blocks
+from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, edge_graph, length_graph
 
 BLOCK_POSES = 8
@@ -511,7 +511,9 @@ class AcapCodec:
         )
         self._nowhere = np.zeros_like(self.rest_mean)
 
-    def encode(self, vertices: npt.NDArray[Any], n_threads: int | None = None) -> FloatArray:
+    def encode(
+        self, vertices: npt.NDArray[Any], n_threads: int | None = None, job: Job = UNWATCHED
+    ) -> FloatArray:
         """Compute the deformation features of poses that are aligned to the reference.
 
         Parameters
@@ -519,6 +521,7 @@ class AcapCodec:
         vertices : (B, V, 3) finite array, in normalised lengths; translation does not
             matter, rotation does
         n_threads : threads to spread the poses over, one for each core by default
+        job : reports (poses done, all poses); polled every few poses
 
         Returns
         -------
@@ -527,6 +530,7 @@ class AcapCodec:
         Raises
         ------
         ShapeError : another shape.
+        CancelledError : the job was cancelled.
         """
         poses = self._checked(vertices, 3, "vertices")
         features = np.empty((len(poses), self.topology.n_vertices, N_FEATURES))
@@ -544,7 +548,7 @@ class AcapCodec:
                     features[pose, :, :N_ROTATION],
                 )
 
-        for_blocks(encode_block, len(poses), BLOCK_POSES, n_threads)
+        for_blocks(encode_block, len(poses), BLOCK_POSES, n_threads, job)
         return features
 
     def decode(self, features: npt.NDArray[Any], n_threads: int | None = None) -> FloatArray:

@@ -130,7 +130,7 @@ class _Trainer:
         self._codec = AcapCodec(topology, vertices[0], weights, bridges)
         self._vertices = np.repeat(self._codec.rest_vertices[None], len(vertices), axis=0)
         self._vertices[:, self._picked] = alignment.vertices
-        self._features = self._codec.encode(self._vertices)
+        self._features = self._codec.encode(self._vertices, job=job.part())
         self._config, self._seed = config, seed
         self._everyone = np.arange(len(vertices))
         stride = config.held_out_stride

@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from lcollision_core.acap.codec import AcapCodec
-from lcollision_core.errors import ShapeError
+from lcollision_core.acap.codec import BLOCK_POSES, AcapCodec
+from lcollision_core.errors import CancelledError, ShapeError
+from lcollision_core.jobs import Job
 from tests.core.acap.jumps import n_jumps
 from tests.core.shapes import Mesh, grid, join, random_rotation, sphere, torus
 
@@ -93,6 +94,22 @@ def test_rigid_motion_gives_every_vertex_the_same_rotation_vector() -> None:
     features = codec_of(mesh).encode((mesh.vertices @ rotation.T)[None])
     expected = np.broadcast_to(angle * axis, (len(mesh.vertices), 3))
     assert features[0, :, :3] == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_cancelled_job_ends_encoding_after_a_block() -> None:
+    mesh = sphere()
+    poses = np.repeat(mesh.vertices[None], 10 * BLOCK_POSES, axis=0)
+    done: list[int] = []
+
+    def on_report(n_done: int, n_poses: int) -> None:
+        assert n_poses == len(poses)
+        done.append(n_done)
+        job.cancel()
+
+    job = Job(on_report)
+    with pytest.raises(CancelledError):
+        codec_of(mesh).encode(poses, 1, job)
+    assert done == [BLOCK_POSES]
 
 
 def test_flat_stretch_is_exact_and_is_the_stretch() -> None:
