@@ -19,6 +19,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import numpy.typing as npt
+import trimesh
 
 from app.benchmarks.measures import Row
 from lcollision_core.bodies.remembered import open_character
@@ -31,14 +32,6 @@ from lcollision_core.files import write_mesh
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray
-
-_CUBE = np.array(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij")).reshape(3, 8).T
-_CUBE_FACES = np.array(
-    [
-        *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
-        *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
-    ]
-)
 
 Posed = tuple[SceneBody, FloatArray]
 """A scene and the codes of its pose."""
@@ -56,9 +49,8 @@ class _Actor:
         }
         if "Embrace" not in self.codes:
             what = "arms and legs are not known by their joints' names"
-            raise LCollisionError(what, "set joint roles: see lcollision joints", where=file)
-        self.axes = np.stack([np.cross(self.space.up, self.space.front), self.space.up])
-        self.axes = np.concatenate([self.axes, self.space.front[None]])
+            raise LCollisionError(what, "set them by `lcollision domains --role`", where=file)
+        self.axes = self.space.to_body
         self.height = float(np.ptp(self.space.rest_vertices @ self.space.up))
 
     def points(self, pose: str, role: Role | None = None, side: Side | None = None) -> FloatArray:
@@ -83,13 +75,14 @@ class _Actor:
         low, high : (3,) corners
         holder : the joint that holds it; a box without one stands still
         """
-        corners = (0.5 * (low + high) + _CUBE * (high - low)) * self.height @ self.axes
+        mesh = trimesh.creation.box(bounds=[low, high])
+        corners = mesh.vertices * self.height @ self.axes
         if holder:
             joint = self.space.rig.joint_names.index(holder)
             moved = self.space.transforms(self.codes[pose])[joint]
             move = self.space.rig.rest[joint] @ np.linalg.inv(moved)
             corners = corners @ move[:3, :3].T + move[:3, 3]
-        write_mesh(folder / "box.obj", corners, _CUBE_FACES)
+        write_mesh(folder / "box.obj", corners, mesh.faces)
         held_by = self.body.name if holder else ""
         box = ScenePart(str(folder / "box.obj"), fixed=not holder, held_by=held_by, joint=holder)
         scene = body_of_scene(SceneFile((ScenePart(str(self.file), self.body.name), box)))
@@ -140,11 +133,8 @@ def _sword(actor: _Actor, folder: Path) -> Posed:
     thigh = _nearest_level(thigh, hand).mean(axis=0)
     low, high = np.minimum(hand, thigh) - 0.006, np.maximum(hand, thigh) + 0.006
     low[1], high[1] = hand[1] - 0.006, hand[1] + 0.006
-    names, roles = (
-        actor.space.rig.joint_names,
-        zip(actor.space.roles, actor.space.sides, strict=True),
-    )
-    holder = names[list(roles).index((Role.HAND, Side.RIGHT))]
+    kinds = list(zip(actor.space.roles, actor.space.sides, strict=True))
+    holder = actor.space.rig.joint_names[kinds.index((Role.HAND, Side.RIGHT))]
     return actor.with_box(folder, "Stand", low, high, holder)
 
 
