@@ -429,20 +429,38 @@ def _are_uncounted(tree: FaceTree, made: SkippableNodes, a: int, b: int) -> bool
 
 @compiled
 def _fill_inner(tree: FaceTree, nodes: IntArray, made: SkippableNodes) -> None:
-    """Fill in the table of the inner nodes of one depth from those of their children."""
+    """Fill in the table of the inner nodes of one depth from those of their children.
+
+    Most pairs count, so only those whose first leaves are in the leaves' table are looked at.
+    """
     table, stride = made.start[made.level[nodes[0]]], made.stride[made.level[nodes[0]]]
+    leaves = made.level[len(tree.left) - 1]
+    first_leaf = np.empty(len(nodes), dtype=np.int32)
+    begins = np.full(8 * made.stride[leaves], -1, dtype=np.int32)  # the node with this first leaf
+    for i in range(len(nodes)):
+        node = nodes[i]
+        while tree.leaf[node] < 0:
+            node = tree.left[node]
+        first_leaf[i] = tree.leaf[node]
+        begins[first_leaf[i]] = i
     for i in range(len(nodes)):
         a = nodes[i]
-        for j in range(i, len(nodes)):
-            b = nodes[j]
-            if (
-                _are_uncounted(tree, made, tree.left[a], tree.left[b])
-                and _are_uncounted(tree, made, tree.left[a], tree.right[b])
-                and _are_uncounted(tree, made, tree.right[a], tree.left[b])
-                and _are_uncounted(tree, made, tree.right[a], tree.right[b])
-            ):
-                made.bits[table + i * stride + (j >> 3)] |= np.uint8(1 << (j & 7))
-                made.bits[table + j * stride + (i >> 3)] |= np.uint8(1 << (i & 7))
+        row = made.start[leaves] + first_leaf[i] * made.stride[leaves]
+        for byte in range(made.stride[leaves]):
+            bits = made.bits[row + byte]
+            for bit in range(8 if bits else 0):
+                j = begins[8 * byte + bit]
+                if j < i or not (bits >> bit) & 1:
+                    continue
+                b = nodes[j]
+                if (
+                    _are_uncounted(tree, made, tree.left[a], tree.left[b])
+                    and _are_uncounted(tree, made, tree.left[a], tree.right[b])
+                    and _are_uncounted(tree, made, tree.right[a], tree.left[b])
+                    and _are_uncounted(tree, made, tree.right[a], tree.right[b])
+                ):
+                    made.bits[table + i * stride + (j >> 3)] |= np.uint8(1 << (j & 7))
+                    made.bits[table + j * stride + (i >> 3)] |= np.uint8(1 << (i & 7))
 
 
 def coincide(triangles: FloatArray, tolerance: float) -> npt.NDArray[np.bool_]:
