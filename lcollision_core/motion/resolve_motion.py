@@ -176,6 +176,8 @@ def resolve_motion(
             reports = _Reports(job, len(bodies) + 1)
             each = _each_by_itself(run, bodies, up, workers, reports)
             together = begin(each, job.part(), UNWATCHED)
+            # What one body has in the way of another, its contacts alone rarely tell.
+            together.patience = 0
             together.job = job.part(reports.of(len(bodies)))
             resolved = run.judged(together.result())
             if resolved is not None:
@@ -276,6 +278,7 @@ class _Resolution:
     solved : for a span, the number of its frames in finished windows
     freed : for a span, the corrections that free frames of its unfinished window, by frame
     n_frames, n_done : number of frames of spans, and of those that are done
+    patience : see `SpanProgram`
     """
 
     motion: Motion
@@ -306,6 +309,7 @@ class _Resolution:
     lock: Lock = field(default_factory=Lock)
     n_frames: int = 0
     n_done: float = 0.0
+    patience: int = 1
 
     @classmethod
     def begin(
@@ -618,6 +622,7 @@ class _Resolution:
                 self._smoothness,
                 fractions,
                 knots,
+                self.patience,
                 is_round and len(window) == n,
                 tell,
             )

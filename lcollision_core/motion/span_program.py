@@ -8,7 +8,7 @@ entries (a_i^T A^-1 a_j) (n_i^T G^-1 n_j).
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -287,6 +287,9 @@ _REFUTED, _SLACK = 5e-4, 1e-5
 """Half-spaces that a free pose violates by more than the first, normalised, are dropped; the others
 are moved to hold it with the second."""
 
+_HELD = 2.0 * _SLACK
+"""Excess up to which a half-space holds a pose that is to be excluded."""
+
 _BEYOND, _BOUNDED, _BOUND_ROUNDS = 0.01, 60, 3
 """Excess beyond their limits from which codes become constraints, the most of these in a round, the
 farthest first, and the most rounds."""
@@ -336,6 +339,8 @@ class SpanProgram:
     fractions : for each of the n frames, fractions of the way to the next of poses that must be
         free too
     knots : (n,) frames that are resolved first, the others and the poses between after them
+    patience : number of times that contacts may hold a colliding pose of a frame, before a
+        half-space across the way from its known free pose excludes it
     is_cycle : whether the first frame follows the last
     tell : called with an estimate of the share done, in [0, 1)
     """
@@ -349,6 +354,7 @@ class SpanProgram:
     smoothness: float
     fractions: Sequence[FloatArray]
     knots: npt.NDArray[np.bool_]
+    patience: int
     is_cycle: bool = False
     tell: Callable[[float], None] = UNWATCHED.report
     _rounds: int = 0
@@ -357,6 +363,7 @@ class SpanProgram:
     _between: dict[tuple[int, float], list[HalfSpacesOfPose]] = field(default_factory=dict)
     _limits: dict[tuple[int, int], float] = field(default_factory=dict)
     _pulls: dict[int, Pulls] = field(default_factory=dict)
+    _n_held: Counter[int] = field(default_factory=Counter)
     _clear: dict[tuple[int, float], FloatArray] = field(default_factory=dict)
     _best: _Evaluation | None = None
     _n_dropped: int = 0
@@ -474,6 +481,7 @@ class SpanProgram:
         for seen in (*self._contacts, *self._between.values()):
             seen.clear()
         self._limits.clear()
+        self._n_held.clear()
         ends = self._targets + best.corrections
         freed = best.is_free & self._watched
         self._known = np.where(freed[:, None], ends, self._known)
@@ -716,6 +724,20 @@ class SpanProgram:
             self._known[at] = free
         if half_spaces := frames.contacts(frame, colliding):
             self._contacts[at].append(half_spaces)
+        self._cut_off(at, goal)
+
+    def _cut_off(self, at: int, goal: FloatArray) -> None:
+        """Exclude a colliding (D,) pose of a frame that its contacts hold."""
+        own = self._own_half_spaces(at)
+        if not self._is_known[at] or any(
+            (normals @ goal > offsets + _HELD).any() for normals, offsets in own
+        ):
+            return
+        self._n_held[at] += 1
+        if self._n_held[at] > self.patience:
+            known = self._known[at]
+            across = self.frames.metric @ (goal - known) / self.frames.distance(goal, known)
+            self._contacts[at].append((across[None], across[None] @ known))
 
     def _free_beside(
         self, at: int, goal: FloatArray, known: Mapping[int, FloatArray]
@@ -792,28 +814,35 @@ class SpanProgram:
 
     def _half_spaces(self, pinned: dict[int, FloatArray]) -> list[_Block]:
         n = len(self._targets)
-        own, of_between = _REMEMBERED
         shares, blocks = np.eye(n), []
-        for at, seen in enumerate(self._contacts):
+        for at in range(n):
             if at in pinned or (at in self._hopeless and not self._is_known[at]):
                 continue
             target = self._targets[at]
-            for normals, offsets in seen[-own:]:
-                if self._is_known[at]:
-                    at_free = normals @ self._known[at]
-                    kept = at_free - offsets <= _REFUTED
-                    if self._gives_way:
-                        offsets = np.maximum(offsets, at_free - _SLACK)
-                    normals, offsets = normals[kept], offsets[kept]
+            for normals, offsets in self._own_half_spaces(at):
                 blocks.append((shares[at], normals, offsets - normals @ target))
         for (at, fraction), seen in self._between.items():
             share, target = (
                 (1.0 - fraction) * rows[at] + fraction * rows[(at + 1) % n]
                 for rows in (shares, self._targets)
             )
-            for normals, offsets in seen[-of_between:]:
+            for normals, offsets in seen[-_REMEMBERED[1] :]:
                 blocks.append((share, normals, offsets - normals @ target))
         return blocks
+
+    def _own_half_spaces(self, at: int) -> list[HalfSpacesOfPose]:
+        """Return the half-spaces of one frame that its known free pose does not refute."""
+        seen = self._contacts[at][-_REMEMBERED[0] :]
+        if not self._is_known[at]:
+            return seen
+        rows = []
+        for normals, offsets in seen:
+            at_free = normals @ self._known[at]
+            kept = at_free - offsets <= _REFUTED
+            if self._gives_way:
+                offsets = np.maximum(offsets, at_free - _SLACK)
+            rows.append((normals[kept], offsets[kept]))
+        return rows
 
     def _limit(self, at: int, code: int, side: float) -> _Block:
         n, size = self._targets.shape
