@@ -727,10 +727,15 @@ class SpanProgram:
         self._cut_off(at, goal)
 
     def _cut_off(self, at: int, goal: FloatArray) -> None:
-        """Exclude a colliding (D,) pose of a frame that its contacts hold."""
+        """Exclude a colliding (D,) pose of a frame that its contacts hold.
+
+        A patch that should touch comes back to where it collides, and is not to be kept away.
+        """
         own = self._own_half_spaces(at)
-        if not self._is_known[at] or any(
-            (normals @ goal > offsets + _HELD).any() for normals, offsets in own
+        if (
+            at in self._pulls
+            or not self._is_known[at]
+            or any((normals @ goal > offsets + _HELD).any() for normals, offsets in own)
         ):
             return
         self._n_held[at] += 1
