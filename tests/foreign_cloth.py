@@ -3,7 +3,8 @@
 ``python -m tests.foreign_cloth CHARACTER.glb FRAMES.npz [PPF]`` counts intersections in the file
 written by the task `prepare` of `tests/app/blender/inside_cloth.py`, with ipctk and with
 ppf-contact-solver's mesh check in Python. PPF is a folder with a package `ppf` that contains
-`_bvh_.py` and `_intersection_.py` of its `frontend` (of December 2025; later ones are in Rust).
+`_bvh_.py`, `_intersection_.py` and `_proximity_.py` of its `frontend` (of December 2025; later ones
+are in Rust), which need tqdm.
 """
 
 from __future__ import annotations
@@ -43,15 +44,15 @@ def by_ipctk(frames: FloatArray, faces: IntArray) -> tuple[list[int], list[int]]
     return crossing, hit
 
 
-def faces_with(parts: npt.NDArray[Any], faces: npt.NDArray[Any]) -> list[list[int]]:
-    """Return, for each of (n, k) groups of vertices, the faces that contain all of them."""
-    found: list[set[int]] = [set() for _ in range(faces.max() + 1)]
+def faces_with(parts: npt.NDArray[Any], faces: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """Return, for each of (n, k) groups of vertices, the faces that contain all; -1 pads rows."""
+    around: list[set[int]] = [set() for _ in range(faces.max() + 1)]
     for face, corners in enumerate(faces.tolist()):
         for corner in corners:
-            found[corner].add(face)
-    return [
-        sorted(set.intersection(*(found[vertex] for vertex in part))) for part in parts.tolist()
-    ]
+            around[corner].add(face)
+    rows = [sorted(set.intersection(*(around[vertex] for vertex in part))) for part in parts]
+    longest = max(map(len, rows))
+    return np.array([row + [-1] * (longest - len(row)) for row in rows])
 
 
 def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int], list[int]]:
@@ -68,23 +69,21 @@ def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int],
     of = {
         "vertex": faces_with(np.arange(body.n_vertices)[:, None], faces),
         "edge": faces_with(edges, faces),
-        "face": [[face] for face in range(len(faces))],
+        "face": np.arange(len(faces))[:, None],
     }
 
     def counted(candidates: list[Any], one: str, other: str) -> list[Any]:
-        sides = [(side, of[side.rstrip("01")]) for side in (one, other)]
-        both = [[known[getattr(c, f"{side}_id")] for c in candidates] for side, known in sides]
-        rows = [
-            (row, a, b)
-            for row, (left, right) in enumerate(zip(*both, strict=True))
-            for a in left
-            for b in right
-        ]
-        table = np.array(rows, dtype=np.int32).reshape(-1, 3)
-        share = faces[table[:, 1], :, None] == faces[table[:, 2], None, :]
-        table = table[~share.any(axis=(1, 2))]
-        counts = detector.rules_of(table[:, 1:], np.ones(len(table))) == 0
-        return [candidates[row] for row in np.unique(table[counts, 0])]
+        left, right = (
+            of[side.rstrip("01")][[getattr(c, f"{side}_id") for c in candidates]]
+            for side in (one, other)
+        )
+        both = np.stack(np.broadcast_arrays(left[:, :, None], right[:, None, :]), axis=-1)
+        row, *_ = np.nonzero((both >= 0).all(axis=-1))
+        pairs = both[(both >= 0).all(axis=-1)].astype(np.int32)
+        share = faces[pairs[:, 0], :, None] == faces[pairs[:, 1], None, :]
+        apart = ~share.any(axis=(1, 2))
+        counts = detector.rules_of(pairs[apart], np.ones(int(apart.sum()))) == 0
+        return [candidates[at] for at in np.unique(row[apart][counts])]
 
     # Skip most pairs near at rest, by single vertices; the rules decide on the rest.
     start, near = detector._exclusions.near
@@ -125,6 +124,8 @@ def by_ppf(frames: FloatArray, faces: IntArray, folder: str) -> list[IntArray]:
     """Return the (n, 2) pairs of triangles that ppf's check finds in each frame."""
     if folder not in sys.path:
         sys.path.insert(0, folder)
+    # Its modules import each other, and load only in this order.
+    import ppf._bvh_  # type: ignore[import-not-found]  # noqa: F401
     from ppf._intersection_ import check_self_intersection  # type: ignore[import-not-found]
 
     return [
