@@ -176,7 +176,7 @@ def resolve_motion(
             reports = _Reports(job, len(bodies) + 1)
             each = _each_by_itself(run, bodies, up, workers, reports)
             together = begin(each, job.part(), UNWATCHED)
-            # What one body has in the way of another, its contacts alone rarely tell.
+            # Where bodies meet, waiting for contacts to exclude a pose ended in jerks.
             together.patience = 0
             together.job = job.part(reports.of(len(bodies)))
             resolved = run.judged(together.result())

@@ -287,8 +287,8 @@ _REFUTED, _SLACK = 5e-4, 1e-5
 """Half-spaces that a free pose violates by more than the first, normalised, are dropped; the others
 are moved to hold it with the second."""
 
-_HELD = 2.0 * _SLACK
-"""Excess up to which a half-space holds a pose that is to be excluded."""
+_LEAST_EXCESS = 2.0 * _SLACK
+"""Excess above which a half-space excludes a pose."""
 
 _BEYOND, _BOUNDED, _BOUND_ROUNDS = 0.01, 60, 3
 """Excess beyond their limits from which codes become constraints, the most of these in a round, the
@@ -339,7 +339,7 @@ class SpanProgram:
     fractions : for each of the n frames, fractions of the way to the next of poses that must be
         free too
     knots : (n,) frames that are resolved first, the others and the poses between after them
-    patience : number of times that contacts may hold a colliding pose of a frame, before a
+    patience : number of times that contacts may allow a colliding pose of a frame, before a
         half-space across the way from its known free pose excludes it
     is_cycle : whether the first frame follows the last
     tell : called with an estimate of the share done, in [0, 1)
@@ -363,7 +363,7 @@ class SpanProgram:
     _between: dict[tuple[int, float], list[HalfSpacesOfPose]] = field(default_factory=dict)
     _limits: dict[tuple[int, int], float] = field(default_factory=dict)
     _pulls: dict[int, Pulls] = field(default_factory=dict)
-    _n_held: Counter[int] = field(default_factory=Counter)
+    _n_allowed: Counter[int] = field(default_factory=Counter)
     _clear: dict[tuple[int, float], FloatArray] = field(default_factory=dict)
     _best: _Evaluation | None = None
     _n_dropped: int = 0
@@ -481,7 +481,7 @@ class SpanProgram:
         for seen in (*self._contacts, *self._between.values()):
             seen.clear()
         self._limits.clear()
-        self._n_held.clear()
+        self._n_allowed.clear()
         ends = self._targets + best.corrections
         freed = best.is_free & self._watched
         self._known = np.where(freed[:, None], ends, self._known)
@@ -727,7 +727,7 @@ class SpanProgram:
         self._cut_off(at, goal)
 
     def _cut_off(self, at: int, goal: FloatArray) -> None:
-        """Exclude a colliding (D,) pose of a frame that its contacts hold.
+        """Exclude a colliding (D,) pose of a frame that its contacts allow.
 
         A patch that should touch comes back to where it collides, and is not to be kept away.
         """
@@ -735,13 +735,14 @@ class SpanProgram:
         if (
             at in self._pulls
             or not self._is_known[at]
-            or any((normals @ goal > offsets + _HELD).any() for normals, offsets in own)
+            or any((normals @ goal > offsets + _LEAST_EXCESS).any() for normals, offsets in own)
         ):
             return
-        self._n_held[at] += 1
-        if self._n_held[at] > self.patience:
-            known = self._known[at]
-            across = self.frames.metric @ (goal - known) / self.frames.distance(goal, known)
+        self._n_allowed[at] += 1
+        known = self._known[at]
+        apart = self.frames.distance(goal, known)
+        if self._n_allowed[at] > self.patience and apart > 0.0:
+            across = self.frames.metric @ (goal - known) / apart
             self._contacts[at].append((across[None], across[None] @ known))
 
     def _free_beside(

@@ -1,4 +1,4 @@
-"""Colliding poses that the contacts of a frame do not exclude."""
+"""Colliding poses that the contacts of a frame allow."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.core.motion.swings import swinging
 
 
 @pytest.mark.parametrize("patience", [0, 2])
-def test_a_pose_that_contacts_hold_is_cut_off_from_the_free_one(patience: int) -> None:
+def test_a_pose_that_contacts_allow_is_cut_off_from_the_free_one(patience: int) -> None:
     body, motion = swinging()
     with ThreadPoolExecutor(1) as pool:
         frames = Frames(motion, body.resolver, ResolveOptions(), pool)
