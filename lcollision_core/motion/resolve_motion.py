@@ -176,8 +176,8 @@ def resolve_motion(
             reports = _Reports(job, len(bodies) + 1)
             each = _each_by_itself(run, bodies, up, workers, reports)
             together = begin(each, job.part(), UNWATCHED)
-            # Where bodies meet, waiting for contacts to exclude a pose ended in jerks.
-            together.patience = 0
+            # Where bodies meet, poses that contacts allow came back, and ended in jerks.
+            together.cuts_off = True
             together.job = job.part(reports.of(len(bodies)))
             resolved = run.judged(together.result())
             if resolved is not None:
@@ -278,7 +278,7 @@ class _Resolution:
     solved : for a span, the number of its frames in finished windows
     freed : for a span, the corrections that free frames of its unfinished window, by frame
     n_frames, n_done : number of frames of spans, and of those that are done
-    patience : see `SpanProgram`
+    cuts_off : see `SpanProgram`
     """
 
     motion: Motion
@@ -309,7 +309,7 @@ class _Resolution:
     lock: Lock = field(default_factory=Lock)
     n_frames: int = 0
     n_done: float = 0.0
-    patience: int = 1
+    cuts_off: bool = False
 
     @classmethod
     def begin(
@@ -622,7 +622,7 @@ class _Resolution:
                 self._smoothness,
                 fractions,
                 knots,
-                self.patience,
+                self.cuts_off,
                 is_round and len(window) == n,
                 tell,
             )

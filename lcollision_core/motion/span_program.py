@@ -8,7 +8,7 @@ entries (a_i^T A^-1 a_j) (n_i^T G^-1 n_j).
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -339,8 +339,8 @@ class SpanProgram:
     fractions : for each of the n frames, fractions of the way to the next of poses that must be
         free too
     knots : (n,) frames that are resolved first, the others and the poses between after them
-    patience : number of times that contacts may allow a colliding pose of a frame, before a
-        half-space across the way from its known free pose excludes it
+    cuts_off : whether a half-space across the way from a frame's known free pose excludes a
+        colliding pose that its contacts allow
     is_cycle : whether the first frame follows the last
     tell : called with an estimate of the share done, in [0, 1)
     """
@@ -354,7 +354,7 @@ class SpanProgram:
     smoothness: float
     fractions: Sequence[FloatArray]
     knots: npt.NDArray[np.bool_]
-    patience: int
+    cuts_off: bool
     is_cycle: bool = False
     tell: Callable[[float], None] = UNWATCHED.report
     _rounds: int = 0
@@ -363,7 +363,6 @@ class SpanProgram:
     _between: dict[tuple[int, float], list[HalfSpacesOfPose]] = field(default_factory=dict)
     _limits: dict[tuple[int, int], float] = field(default_factory=dict)
     _pulls: dict[int, Pulls] = field(default_factory=dict)
-    _n_allowed: Counter[int] = field(default_factory=Counter)
     _clear: dict[tuple[int, float], FloatArray] = field(default_factory=dict)
     _best: _Evaluation | None = None
     _n_dropped: int = 0
@@ -481,7 +480,6 @@ class SpanProgram:
         for seen in (*self._contacts, *self._between.values()):
             seen.clear()
         self._limits.clear()
-        self._n_allowed.clear()
         ends = self._targets + best.corrections
         freed = best.is_free & self._watched
         self._known = np.where(freed[:, None], ends, self._known)
@@ -724,24 +722,17 @@ class SpanProgram:
             self._known[at] = free
         if half_spaces := frames.contacts(frame, colliding):
             self._contacts[at].append(half_spaces)
-        self._cut_off(at, goal)
+        if self.cuts_off:
+            self._cut_off(at, goal)
 
     def _cut_off(self, at: int, goal: FloatArray) -> None:
-        """Exclude a colliding (D,) pose of a frame that its contacts allow.
-
-        A patch that should touch comes back to where it collides, and is not to be kept away.
-        """
-        own = self._own_half_spaces(at)
-        if (
-            at in self._pulls
-            or not self._is_known[at]
-            or any((normals @ goal > offsets + _LEAST_EXCESS).any() for normals, offsets in own)
-        ):
-            return
-        self._n_allowed[at] += 1
-        known = self._known[at]
+        """Exclude a colliding (D,) pose of a frame that its contacts allow."""
+        known, own = self._known[at], self._own_half_spaces(at)
         apart = self.frames.distance(goal, known)
-        if self._n_allowed[at] > self.patience and apart > 0.0:
+        is_excluded = any(
+            (normals @ goal > offsets + _LEAST_EXCESS).any() for normals, offsets in own
+        )
+        if self._is_known[at] and apart > 0.0 and not is_excluded:
             across = self.frames.metric @ (goal - known) / apart
             self._contacts[at].append((across[None], across[None] @ known))
 
