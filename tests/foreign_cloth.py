@@ -26,8 +26,6 @@ IntArray = npt.NDArray[np.int32]
 
 def by_ipctk(frames: FloatArray, faces: IntArray) -> tuple[list[int], list[int]]:
     """Return the frames that intersect, and those with a hit on the linear path to the next."""
-    import ipctk
-
     topology = Topology(faces, frames.shape[1])
     mesh = ipctk.CollisionMesh(
         np.asfortranarray(frames[0]), np.asfortranarray(topology.edges), np.asfortranarray(faces)
@@ -78,8 +76,8 @@ def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int],
             for side in (one, other)
         )
         both = np.stack(np.broadcast_arrays(left[:, :, None], right[:, None, :]), axis=-1)
-        row, *_ = np.nonzero((both >= 0).all(axis=-1))
-        pairs = both[(both >= 0).all(axis=-1)].astype(np.int32)
+        are_faces = (both >= 0).all(axis=-1)
+        row, pairs = np.nonzero(are_faces)[0], both[are_faces].astype(np.int32)
         share = faces[pairs[:, 0], :, None] == faces[pairs[:, 1], None, :]
         apart = ~share.any(axis=(1, 2))
         counts = detector.rules_of(pairs[apart], np.ones(int(apart.sum()))) == 0

@@ -276,7 +276,7 @@ _STILL = 1e-4
 """Normalised distance from a pose that was free within which a frame is taken as free, until all
 others are."""
 
-_REMEMBERED = 6, 3
+_REMEMBERED, _REMEMBERED_BETWEEN = 6, 3
 """Number of poses whose contacts are used, for each frame and between frames."""
 
 _NEAR, _HALVINGS = 0.004, 3
@@ -823,13 +823,13 @@ class SpanProgram:
                 (1.0 - fraction) * rows[at] + fraction * rows[(at + 1) % n]
                 for rows in (shares, self._targets)
             )
-            for normals, offsets in seen[-_REMEMBERED[1] :]:
+            for normals, offsets in seen[-_REMEMBERED_BETWEEN:]:
                 blocks.append((share, normals, offsets - normals @ target))
         return blocks
 
     def _own_half_spaces(self, at: int) -> list[HalfSpacesOfPose]:
         """Return the half-spaces of one frame that its known free pose does not refute."""
-        seen = self._contacts[at][-_REMEMBERED[0] :]
+        seen = self._contacts[at][-_REMEMBERED:]
         if not self._is_known[at]:
             return seen
         rows = []
