@@ -1,6 +1,7 @@
 """The one way of whole sentences to people: a translation sets its catalogue as `CATALOGUE`.
 
-`xgettext -k say -k say_number:2,3 -k marked` collects them: each is a literal with named fields.
+`xgettext -k say -k say_number:2,3 -k counted:2,3 -k marked` collects them: each is a literal with
+named fields.
 """
 
 from __future__ import annotations

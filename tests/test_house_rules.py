@@ -10,7 +10,12 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-_SENTENCES = {"say": slice(1), "say_number": slice(1, 3), "marked": slice(1)}
+_SENTENCES = {
+    "say": slice(1),
+    "say_number": slice(1, 3),
+    "counted": slice(1, 3),
+    "marked": slice(1),
+}
 _MARKED = {"ALL_LOCKED", "FEET_MOVED", "self.reason"}
 
 

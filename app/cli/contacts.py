@@ -60,9 +60,9 @@ def contacts(
     tell(f"{body.name}: {'every pair counts' if body.rules.exclude_nothing else sentence}")
     if proposed is not None:
         fields = {
-            "poses": counted(proposed.n_poses, "sampled pose"),
+            "poses": counted(proposed.n_poses, "sampled pose", "sampled poses"),
             "then": proposed.n_colliding_then or "none",
-            "places": counted(len(proposed.new), "place"),
+            "places": counted(len(proposed.new), "place", "places"),
         }
         tell(
             say_number(
@@ -75,7 +75,7 @@ def contacts(
             )
         )
         for pair, number in proposed.places.items():
-            tell(f"    {pair_in_words(pair)}: {counted(number, 'place')}")
+            tell(f"    {pair_in_words(pair)}: {counted(number, 'place', 'places')}")
 
 
 def _proposed_json(proposed: ProposedRules | None) -> dict[str, Any] | None:

@@ -128,7 +128,7 @@ def _print_proposed(proposed: Sequence[ProposedPair], rules: ContactRules) -> No
 def _print(path: Path, report: dict[str, Any], up: str) -> None:
     surface = "watertight" if report["watertight"] else "not watertight"
     tell(
-        f"{path}: {counted(report['poses'], 'pose')} of {report['vertices']} vertices and "
+        f"{path}: {counted(report['poses'], 'pose', 'poses')} of {report['vertices']} vertices and "
         f"{report['faces']} faces, {surface}"
     )
     typer.echo(f"  {up}")
@@ -138,7 +138,7 @@ def _print(path: Path, report: dict[str, Any], up: str) -> None:
     tell(f"  {counted(n_colliding, 'pose intersects itself', 'poses intersect themselves')}")
     for pose in report["colliding"]:
         tell(
-            f"    {pose['pose']}: {counted(pose['pairs'], 'pair')}, "
+            f"    {pose['pose']}: {counted(pose['pairs'], 'pair', 'pairs')}, "
             f"normalised energy {pose['energy']:.3g}"
         )
 
@@ -269,7 +269,7 @@ def _gathered(
                 drawn["free"],
                 "{n} of {poses} by the rig is free of collisions",
                 "{n} of {poses} by the rig are free of collisions",
-                poses=counted(drawn["drawn"], "pose"),
+                poses=counted(drawn["drawn"], "pose", "poses"),
             )
         )
     if not (guess := poses.up).is_sure:

@@ -144,7 +144,7 @@ def evaluate(
         samples = _samples(scored, "pose" if of_poses else "sample", numbers, threshold)
     if samples_csv is not None:
         write_table(samples_csv, samples[0], samples)
-        note(f"wrote {counted(len(rows), 'sample')} to {samples_csv}")
+        note(f"wrote {counted(len(rows), 'sample', 'samples')} to {samples_csv}")
     report = _report(scored, threshold, model.domain_names)
     if as_json:
         measured = {"colliding_share": float(rows.colliding.mean()), "threshold": threshold}
@@ -162,7 +162,7 @@ def evaluate(
     tell(f"{model.name}, preset {trained.config.described}{called}: {scores}")
     tell(
         f"  {measured_model_sentence(model)}; {_percent(rows.colliding.mean())} of these "
-        f"{counted(len(rows), 'sample')} collide"
+        f"{counted(len(rows), 'sample', 'samples')} collide"
     )
     for line in _verdict_lines(report):
         tell(f"  {line}")
@@ -358,7 +358,7 @@ def _unseen(
     numbers = held_out_index(len(rows), trained.config, trained.facts.rows, draws)
     if not len(numbers):
         raise LabelStoreError(
-            f"has {counted(len(rows), 'row')}, none of which is held out",
+            f"has {counted(len(rows), 'row', 'rows')}, none of which is held out",
             "label more",
             where=store.path,
         )

@@ -116,7 +116,7 @@ def label(
             )
     except CancelledError:
         with suppress(LabelStoreError):
-            rows_text = counted(LabelStore.open(output).n_rows, "row")
+            rows_text = counted(LabelStore.open(output).n_rows, "row", "rows")
             note(f"stopped; {output} has {rows_text}; run the same command again to continue")
         raise
     seconds = time.monotonic() - started
@@ -137,7 +137,7 @@ def label(
         print_json(report)
         return
     tell(
-        f"{output}: {counted(status.done, 'row')} of {model.name}, "
+        f"{output}: {counted(status.done, 'row', 'rows')} of {model.name}, "
         f"{100.0 * report['colliding_share']:.1f} % collide "
         f"({status.labelled} labelled now, {status.labelled / seconds:.0f}/s)"
     )
@@ -164,7 +164,7 @@ def _check(model: LearnedBody, path: Path, as_json: bool) -> None:
         rows_text = listed((f"{rows[0]} to {rows[-1]}" for rows in damaged), _LISTED)
         tell(f"{path}: damaged, rows {rows_text}; {store.repair_advice}")
     else:
-        tell(f"{path}: intact, {counted(n_sound, 'row')} of {model.name}")
+        tell(f"{path}: intact, {counted(n_sound, 'row', 'rows')} of {model.name}")
     if damaged:
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 

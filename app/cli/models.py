@@ -181,9 +181,10 @@ def _label_store_sentence(report: dict[str, Any]) -> str:
     rows, held_out = report["rows"], report["held_out"]
     model = report["model"] or f"a model that is not listed ({report['fingerprint']})"
     return (
-        f"{report['store']}: a label store that `lcollision label` made, {counted(rows, 'row')} of "
-        f"{model} ({report['draws']}, seed {report['seed']}), {held_out} of them "
-        f"({100.0 * held_out / max(rows, 1):.0f} %) held out to measure a predictor"
+        f"{report['store']}: a label store that `lcollision label` made, "
+        f"{counted(rows, 'row', 'rows')} of {model} ({report['draws']}, seed {report['seed']}), "
+        f"{held_out} of them ({100.0 * held_out / max(rows, 1):.0f} %) held out to measure a "
+        "predictor"
     )
 
 
@@ -330,7 +331,9 @@ def measured_model_sentence(model: LearnedBody) -> str:
     rule = f"near exclusion {near:g}" if near else "no near exclusion"
     if model.rules != replace(STRICT, near_exclusion=near):
         rule = f"not counted: {model.rules.described()}"
-    return f"|Z_0| = {first}, |Z_k| = {each} for {counted(len(others), 'domain')}, {rule}"
+    return (
+        f"|Z_0| = {first}, |Z_k| = {each} for {counted(len(others), 'domain', 'domains')}, {rule}"
+    )
 
 
 def note_where_written(written: Path, destination: Path) -> None:
@@ -389,9 +392,11 @@ def _size_sentence(report: dict[str, Any]) -> str:
     sliders = "a slider of a morph target" if n_shapes == 1 else "sliders of morph targets"
     shapes = f", {n_shapes} of them {sliders}" if n_shapes else ""
     return (
-        f"{counted(report['vertices'], 'vertex', 'vertices')}, {counted(report['faces'], 'face')}, "
-        f"{counted(report['poses'], 'pose')}, {counted(len(report['domains']), 'domain')}, "
-        f"{counted(report['latent_size'], 'code')} a pose{shapes}"
+        f"{counted(report['vertices'], 'vertex', 'vertices')}, "
+        f"{counted(report['faces'], 'face', 'faces')}, "
+        f"{counted(report['poses'], 'pose', 'poses')}, "
+        f"{counted(len(report['domains']), 'domain', 'domains')}, "
+        f"{counted(report['latent_size'], 'code', 'codes')} a pose{shapes}"
     )
 
 
@@ -421,5 +426,5 @@ def _print_domains(report: dict[str, Any]) -> None:
         tell(
             f"  {number:2d}  {domain['name']}  "
             f"({counted(domain['vertices'], 'vertex', 'vertices')}, "
-            f"{counted(domain['codes'], 'code')})"
+            f"{counted(domain['codes'], 'code', 'codes')})"
         )

@@ -65,7 +65,7 @@ def print_figure(
             raise typer.Exit(ExitStatus.BAD_INPUT)
         matching = [given_pose.pose for given_pose in given if name in (None, given_pose.pose.name)]
         if len(matching) != 1:
-            poses = counted(len(matching), "pose") if matching else "no pose"
+            poses = counted(len(matching), "pose", "poses") if matching else "no pose"
             raise LCollisionError(
                 f"has {poses}{'' if name is None else f' named {name!r}'}",
                 f"name one by --pose: {listed(item.pose.name for item in given)}",

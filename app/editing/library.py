@@ -114,7 +114,7 @@ class Library(QObject):
             p for p in poses if p.name not in pose_by_name or not pose_by_name[p.name].same_as(p)
         ]
         names = self._free_names([pose.name for pose in added])
-        what = added[0].name if len(added) == 1 else counted(len(added), "pose")
+        what = added[0].name if len(added) == 1 else counted(len(added), "pose", "poses")
         new = [replace(p, name=name, moves=None) for p, name in zip(added, names, strict=True)]
         self._step(f"Add {what}", [(None, pose) for pose in new])
         return len(new)
@@ -342,4 +342,4 @@ def retagged(pose: NamedPose, tags: Sequence[str], replaced: Sequence[str]) -> t
 
 
 def _called(poses: Sequence[NamedPose]) -> str:
-    return poses[0].name if len(poses) == 1 else counted(len(poses), "pose")
+    return poses[0].name if len(poses) == 1 else counted(len(poses), "pose", "poses")

@@ -430,7 +430,7 @@ class PoseMotion(QObject):
         state = history.with_latent(read_only(latent))
         history.push("Reset all", replace(state, pose=replace(state.pose, pins=())))
         if self.locked_domains and not self.all_locked:
-            n_locked = counted(len(self.locked_domains), "locked body part")
+            n_locked = counted(len(self.locked_domains), "locked body part", "locked body parts")
             self.message.emit(f"Everything was reset except {n_locked}: see Edit > Unlock all")
         self._tell_if_locked()
 
@@ -778,7 +778,7 @@ class Pins(QObject):
         other_pins = [pin for pin in self._pins if pin.vertex not in added]
         pins = (*other_pins, *added.values())
         if len(pins) > MAX_PINS:
-            self.message.emit(f"A pose has at most {counted(MAX_PINS, 'pin')}")
+            self.message.emit(f"A pose has at most {counted(MAX_PINS, 'pin', 'pins')}")
             return
         self._set(label or f"Pin {part_name(model, grips[0].vertex)}", pins)
 

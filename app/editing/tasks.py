@@ -270,7 +270,7 @@ class Tasks(QObject):
         """
         _ = self._model.pose_mirror
         job = partial(mirror_poses, self._model, tuple(poses))
-        label = f"Mirroring {counted(len(poses), 'pose')}"
+        label = f"Mirroring {counted(len(poses), 'pose', 'poses')}"
         self.start(Work.MIRROR_POSES, label, job, self._on_poses_mirrored)
 
     # Models and files.
@@ -523,7 +523,7 @@ class Tasks(QObject):
         self._history.begin_with(edited, Source.FILE, read.path, content.poses)
         self._history.file_stamp = read.stamp
         notes = () if read.opened is None else read.opened.model.notes
-        text = f"Opened {read.path.name}: {counted(len(content.all_poses), 'pose')}"
+        text = f"Opened {read.path.name}: {counted(len(content.all_poses), 'pose', 'poses')}"
         self.message.emit("; ".join((text, *notes)))
         self.opened.emit(read.path)
 
@@ -583,7 +583,7 @@ class Tasks(QObject):
         if not added:
             self.message.emit("These mirrored poses are already in your library")
             return
-        sentences = [f"Added {counted(added, 'mirrored pose')} to your library"]
+        sentences = [f"Added {counted(added, 'mirrored pose', 'mirrored poses')} to your library"]
         if len(images) == 1:
             sentences.append(mirrored_text(images[0][1]))
         else:

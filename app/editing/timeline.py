@@ -359,7 +359,7 @@ class Timeline(QObject):
         text = say(
             "Opened {file}: {motions}",
             file=Path(path).name,
-            motions=counted(len(motions), "motion"),
+            motions=counted(len(motions), "motion", "motions"),
         )
         self.message.emit(joined((text, *notes)))
         self.joints, self.joints_of = read.joints, Path(path)

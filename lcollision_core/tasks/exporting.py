@@ -367,7 +367,7 @@ def _note_written(
 ) -> None:
     for sentence in dict.fromkeys(sentence for mesh in meshes for sentence in mesh.notes):
         job.note(sentence)
-    poses = counted(n_poses, "pose")
+    poses = counted(n_poses, "pose", "poses")
     if n_replaced:
         job.note(
             say_number(
@@ -675,7 +675,9 @@ def _write_clips(
             written = write_clips(path, body, file, changes)
     for sentence in written.notes:
         job.note(sentence)
-    job.note(say("wrote {clips} to {path}", clips=counted(len(changes), "clip"), path=path))
+    job.note(
+        say("wrote {clips} to {path}", clips=counted(len(changes), "clip", "clips"), path=path)
+    )
     for row, of_file, put_back in zip(rows, written.free, written.put_back, strict=True):
         row.output = str(path)
         # Rounding reduces the clearance slightly; without one, the check of the file decides.
@@ -750,7 +752,7 @@ def write_members(
     job.note(
         say(
             "wrote {poses} of {bodies} to {output}",
-            poses=counted(len(poses), "pose"),
+            poses=counted(len(poses), "pose", "poses"),
             bodies=counted(n_files // len(poses), "body", "bodies"),
             output=folder,
         )

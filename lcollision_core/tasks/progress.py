@@ -39,7 +39,7 @@ class Run(Generic[T]):
     path : of the file
     key : of everything that the results depend on; a file with another key is refused
     total : number of items
-    noun : name of an item, as in "pose"
+    items : them in words, as in "3 poses"
     read : returns the finished items in the file, by name; None if its key differs
     write : writes a record and the finished items
     job : takes the notes
@@ -55,14 +55,14 @@ class Run(Generic[T]):
         path: Path,
         key: str,
         total: int,
-        noun: str,
+        items: str,
         read: Callable[[Path, str], dict[str, T] | None],
         write: Callable[[Path, dict[str, Any], dict[str, T]], None],
         job: Job,
         pause: float,
     ) -> None:
         self.path, self.done = path, dict[str, T]()
-        self._key, self._total, self._noun, self._job = key, total, noun, job
+        self._key, self._total, self._items, self._job = key, total, items, job
         self._read, self._write_all, self._pause = read, write, pause
         self._seconds, self._failure, self._written = 0.0, "", time.monotonic()
 
@@ -81,7 +81,7 @@ class Run(Generic[T]):
             raise self.damaged() from error
         if done is None:
             raise LCollisionError(
-                f"has {self._noun}s of another run (model, options, inputs or program differ)",
+                "is of another run (model, options, inputs or program differ)",
                 "move or delete it, or name another output",
                 where=self.path,
             )
@@ -140,7 +140,7 @@ class Run(Generic[T]):
 
     @property
     def _told(self) -> str:
-        return f"{len(self.done)} of {counted(self._total, self._noun)}"
+        return say("{n} of {items}", n=len(self.done), items=self._items)
 
 
 KeptPose = tuple["NamedPose", Mapping[str, Any]]
@@ -187,7 +187,8 @@ def run_of_poses(
         write_poses(path, body, [done[name][0] for name in names], extra=extra)
 
     key = key_of(body, *depends_on)
-    run = Run(path, key, total, "pose", read, write, job, _SECONDS_BETWEEN_WRITES)
+    items = counted(total, "pose", "poses")
+    run = Run(path, key, total, items, read, write, job, _SECONDS_BETWEEN_WRITES)
     with locked(path, wait=0.0):
         run.begin()
         try:
@@ -231,7 +232,8 @@ def run_of_rows(
         write_bytes(path, json.dumps({**record, "done": done}).encode())
 
     with locked(path, wait=0.0):
-        run = Run(path, key, total, "file", read, write, job, pause=-1.0)
+        items = counted(total, "file", "files")
+        run = Run(path, key, total, items, read, write, job, pause=-1.0)
         run.begin()
         try:
             yield run

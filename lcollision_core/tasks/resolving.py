@@ -345,7 +345,7 @@ class ResolveMotionsRequest:
         if not files:
             return self
         if self.output.form != "folder":
-            what = f"cannot contain {counted(len(files), 'motion')}"
+            what = f"cannot contain {counted(len(files), 'motion', 'motions')}"
             raise LCollisionError(what, "name a folder", where=self.output.path)
         return replace(self, files=files, root=root)
 

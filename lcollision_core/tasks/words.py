@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from lcollision_core import sentences
 from lcollision_core.errors import listed
 from lcollision_core.sentences import joined as joined
 from lcollision_core.sentences import say as say
@@ -68,9 +69,9 @@ def least_distance_words(least: float | None, clearance: float) -> str:
     return say("least distance {distance}", distance=share_text(least))
 
 
-def counted(number: int, noun: str, nouns: str | None = None) -> str:
-    """Format a number with its noun, "1 pair" or "2 pairs"."""
-    return f"{number} {noun if number == 1 else nouns or noun + 's'}"
+def counted(number: int, noun: str, nouns: str) -> str:
+    """Format a number with its translated noun, "1 pair" or "2 pairs"."""
+    return f"{number} {sentences.CATALOGUE.ngettext(noun, nouns, number)}"
 
 
 def grouped(number: int) -> str:
@@ -281,7 +282,7 @@ def checked_mesh_text(verdict: CheckedMesh) -> str:
         file=verdict.file,
         verdict=text,
         vertices=counted(verdict.vertices, "vertex", "vertices"),
-        faces=counted(verdict.faces, "face"),
+        faces=counted(verdict.faces, "face", "faces"),
         seconds=verdict.seconds,
     )
 
@@ -310,7 +311,7 @@ def checked_clip_table(verdicts: Iterable[CheckedClip]) -> list[str]:
 
 def checked_clip_text(verdict: CheckedClip) -> str:
     """Describe the check of one clip."""
-    frames, n_frames = verdict.colliding_frames, counted(verdict.frames, "frame")
+    frames, n_frames = verdict.colliding_frames, counted(verdict.frames, "frame", "frames")
     near = share_text(verdict.clearance)
     parts: list[str | None] = []
     if not verdict.colliding:
@@ -443,7 +444,11 @@ def resolved_pose_text(
 def resolved_clip_text(verdict: ResolvedClip) -> str:
     """Describe the outcome of resolving one motion of a file."""
     n, after, stuck = verdict.frames, verdict.free_after, verdict.colliding_frames
-    fields = {"before": verdict.free_before, "frames": counted(n, "frame"), "after": after}
+    fields = {
+        "before": verdict.free_before,
+        "frames": counted(n, "frame", "frames"),
+        "after": after,
+    }
     if not verdict.output:
         head = say("{before} of {frames} free", **fields)
     elif after == n:
@@ -575,7 +580,7 @@ def exported_text(
             "Exported {name}: {n} of {frames} collides",
             "Exported {name}: {n} of {frames} collide",
             name=name,
-            frames=counted(n_frames, "frame"),
+            frames=counted(n_frames, "frame", "frames"),
         )
     return joined([verdict, *notes])
 
@@ -584,11 +589,11 @@ def printed_text(figure: PrintedFigure) -> str:
     """Describe a file written for printing."""
     x, y, z = figure.size
     layers = [
-        counted(number, f"{kind} layer")
-        for number, kind in (
-            (figure.closed, "closed"),
-            (figure.capped, "capped"),
-            (figure.thickened, "thickened"),
+        text
+        for number, text in (
+            (figure.closed, counted(figure.closed, "closed layer", "closed layers")),
+            (figure.capped, counted(figure.capped, "capped layer", "capped layers")),
+            (figure.thickened, counted(figure.thickened, "thickened layer", "thickened layers")),
         )
         if number
     ]

@@ -38,7 +38,7 @@ def _addable(window: EditorWindow) -> tuple[NamedPose, ...]:
 
 def _tell_added(window: EditorWindow, added: int) -> None:
     window.document.message.emit(
-        f"Added {counted(added, 'pose')} to your library"
+        f"Added {counted(added, 'pose', 'poses')} to your library"
         if added
         else "These poses are already in your library"
     )
@@ -49,7 +49,7 @@ def _export(window: EditorWindow, poses: tuple[NamedPose, ...], title: str) -> N
     name = poses[0].name if len(poses) == 1 else f"{model.name} poses"
     path: Path | None = window.files.ask_save(title, name, {"Poses": ".json"})
     if path is not None:
-        text = f"Exported {counted(len(poses), 'pose')} to {path.name}"
+        text = f"Exported {counted(len(poses), 'pose', 'poses')} to {path.name}"
         job = as_task(save_poses, path, model, poses)
         document.tasks.save_file(path, job, lambda _: text)
 
@@ -69,7 +69,7 @@ def _why_no_tags(tags: Sequence[str]) -> str:
 
 
 def _called(poses: tuple[NamedPose, ...]) -> str:
-    return f"“{poses[0].name}”" if len(poses) == 1 else counted(len(poses), "pose")
+    return f"“{poses[0].name}”" if len(poses) == 1 else counted(len(poses), "pose", "poses")
 
 
 def _why_not_any(window: EditorWindow) -> str:

@@ -351,9 +351,11 @@ class ContactsDialog(Dialog):
     def _on_counted(self, found: ContactsAtRest) -> None:
         """Show how many pairs of the rest pose each rule excludes."""
         for name, label in self.counts.items():
-            label.setText(f"{counted(getattr(found.excluded, name), 'pair')} at rest")
-        left = counted(found.n_counted, "pair")
-        count_text = f"At rest {counted(found.excluded.total, 'pair')} not counted, {left} counted."
+            label.setText(f"{counted(getattr(found.excluded, name), 'pair', 'pairs')} at rest")
+        left = counted(found.n_counted, "pair", "pairs")
+        count_text = (
+            f"At rest {counted(found.excluded.total, 'pair', 'pairs')} not counted, {left} counted."
+        )
         if found.n_counted:
             count_text += " Pairs that collide at rest collide in every pose: widen a rule."
         self._write(self.total, count_text)
@@ -375,8 +377,8 @@ class ContactsDialog(Dialog):
         n_patches = len(self._patches()[0])
         self.always.setEnabled(can_change and n_patches > 0)
         tip = (
-            f"{counted(n_patches, 'place')} found that touch in nearly every pose, with the faces "
-            "close to them"
+            f"{counted(n_patches, 'place', 'places')} found that touch in nearly every pose, with "
+            "the faces close to them"
         )
         self.always.setToolTip(
             tip if n_patches else "No place is known to touch in nearly every pose"

@@ -371,7 +371,7 @@ def _figures(card: LearnedCard) -> list[tuple[str, str]]:
     error = f"{100 * card.error_mean:.2f} % of the body size"
     figures = [
         ("Vertices", grouped(card.vertices)),
-        ("Learned from", counted(card.poses, "pose")),
+        ("Learned from", counted(card.poses, "pose", "poses")),
         ("Body parts", f"{card.parts}"),
         (
             "Error",

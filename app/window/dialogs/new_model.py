@@ -269,10 +269,12 @@ class PosesPage(Page):
         self._summary = summary
         total = summary.n_given() - summary.n_poses
         self.clip.clear()
-        self.clip.addItem(f"All ({counted(total, 'frame')})", None)
+        self.clip.addItem(f"All ({counted(total, 'frame', 'frames')})", None)
         for clip in summary.clips:
             if len(summary.clips) > 1:
-                self.clip.addItem(f"{clip.name} ({counted(clip.n_frames, 'frame')})", clip.name)
+                self.clip.addItem(
+                    f"{clip.name} ({counted(clip.n_frames, 'frame', 'frames')})", clip.name
+                )
         self._clips.setVisible(bool(summary.clips))
         self._rig.setVisible(bool(summary.n_joints))
         axis_source = "As in the file" if summary.up.is_sure else "Guessed"
@@ -327,7 +329,9 @@ class PosesPage(Page):
             return
         values = self.values()
         frames = summary.n_given(values["clip"], values["fps"]) - summary.n_poses
-        self._from_clips.setText(f"Uses {counted(frames, 'animation frame')} as poses.")
+        self._from_clips.setText(
+            f"Uses {counted(frames, 'animation frame', 'animation frames')} as poses."
+        )
         size, scaled = summary.size, summary.size * values["scale"]
         length = f"{size:.4g}"
         if summary.metres is not None:
@@ -497,7 +501,7 @@ class QualityPage(Page):
             )
             samples = grouped(effort.n_samples)
             label.setText(
-                f"{aims[quality]}: {counted(number, 'pose')}, {samples} random ones.\n"
+                f"{aims[quality]}: {counted(number, 'pose', 'poses')}, {samples} random ones.\n"
                 f"{with_capital(spent)}."
             )
 
@@ -726,7 +730,7 @@ class NewModelDialog(Dialog):
         self._facts.clear()
         paths = self.files.paths
         self.files.tell("")
-        self.preview.tell(f"Reading {counted(len(paths), 'file')}…" if paths else _EMPTY)
+        self.preview.tell(f"Reading {counted(len(paths), 'file', 'files')}…" if paths else _EMPTY)
         self._on_changed()
         if paths:
             work = partial(learning_runs.look_into_sources, paths)
@@ -778,7 +782,7 @@ class NewModelDialog(Dialog):
 def _facts(summary: SourcesSummary) -> str:
     """Describe the contents of the files in a few lines."""
     lines = [f"{counted(summary.topology.n_vertices, 'vertex', 'vertices')}"]
-    lines.append(f"{counted(summary.n_given(), 'pose')} in the files")
+    lines.append(f"{counted(summary.n_given(), 'pose', 'poses')} in the files")
     lines.append(f"rig of {summary.n_joints} joints" if summary.n_joints else "no rig")
     if not summary.up.is_sure:
         lines.append(f"Probably {'xyz'[summary.up.axis]} up: check the preview")

@@ -243,7 +243,7 @@ def wait_for_exports(parent: QWidget, document: PoseDocument, pictures: Pictures
 
     if not left():
         return True
-    text = f"Finishing {counted(left(), 'export')}…"
+    text = f"Finishing {counted(left(), 'export', 'exports')}…"
     box = message_box(parent, "Closing", text, "The editor closes once that is done.")
     box.setStandardButtons(QMessageBox.StandardButton.Cancel)
     widen(box)

@@ -644,7 +644,7 @@ class OutcomeCard(Card):
         return say(
             "{verdict}: {pairs}, by up to {depth}",
             verdict=verdict,
-            pairs=counted(result.pairs_after or 0, "pair"),
+            pairs=counted(result.pairs_after or 0, "pair", "pairs"),
             depth=length_text(result.deepest_after or 0.0, millimetres),
         )
 
@@ -796,7 +796,7 @@ class ExactCard(PoseCard):
         headline = "Colliding (checked)" if verdict.colliding else "No collisions (checked)"
         sentences, tips = [], []
         if verdict.colliding:
-            pairs = counted(len(verdict.pairs), "pair")
+            pairs = counted(len(verdict.pairs), "pair", "pairs")
             sentences.append(f"{pairs} of triangles, overlap {overlap_text(verdict.energy)}")
             tips.append(
                 "Overlap: how deep all crossing triangles penetrate each other, combined, in per "
@@ -878,7 +878,10 @@ class ProposalCard(Card):
         if proposed is None or not self._document.tasks.offers_rules:
             self._end()
             return
-        then, places = proposed.n_colliding_then, counted(len(proposed.new), "such place")
+        then, places = (
+            proposed.n_colliding_then,
+            counted(len(proposed.new), "such place", "such places"),
+        )
         remaining = say("With {places} ignored, no pose collides.", places=places)
         if then:
             remaining = say_number(
@@ -891,11 +894,12 @@ class ProposalCard(Card):
             proposed.n_colliding,
             "{n} of {poses} collides, and the same parts touch in nearly all of them.",
             "{n} of {poses} collide, and the same parts touch in nearly all of them.",
-            poses=counted(proposed.n_poses, "sampled pose"),
+            poses=counted(proposed.n_poses, "sampled pose", "sampled poses"),
         )
         self.text.setText(f"{now} {remaining}")
         lines = [
-            f"{pair_in_words(pair)}: {counted(n, 'place')}" for pair, n in proposed.places.items()
+            f"{pair_in_words(pair)}: {counted(n, 'place', 'places')}"
+            for pair, n in proposed.places.items()
         ]
         more = [say("and {n} more", n=len(lines) - _LISTED)] if len(lines) > _LISTED else []
         self.listed.setText("\n".join([*lines[:_LISTED], *more]))

@@ -304,7 +304,7 @@ class TimelinePanel(QWidget):
     def _tell_progress(self, progress: ResolveProgress) -> str:
         if self._timeline.resolving.is_ending:
             return "Stopping…"
-        left, frames = progress.seconds_left, counted(progress.total, "frame")
+        left, frames = progress.seconds_left, counted(progress.total, "frame", "frames")
         if left is not None:
             done, duration = progress.done, duration_text(left)
             return say("{n} of {frames}, {time} left", n=done, frames=frames, time=duration)
@@ -327,7 +327,11 @@ class TimelinePanel(QWidget):
         n = len(checks.deepest)
         deep = np.nan_to_num(checks.deepest)
         n_colliding, n_between = int((deep > 0.0).sum()), int(checks.between.sum())
-        frames, facts, are_all = counted(n, "frame"), ["no collisions"], checks.n_checked == n
+        frames, facts, are_all = (
+            counted(n, "frame", "frames"),
+            ["no collisions"],
+            checks.n_checked == n,
+        )
         if n_colliding:
             colliding = say("{n} of {frames}", n=n_colliding, frames=frames)
             facts = [
@@ -340,7 +344,7 @@ class TimelinePanel(QWidget):
                 )
             ]
         if n_between:
-            collisions = counted(n_between, "collision")
+            collisions = counted(n_between, "collision", "collisions")
             facts.append(say("{mark} {n} between frames", mark=BETWEEN, n=collisions))
         heads = ["as it was read"] if timeline.comparing else []
         if not are_all and (checks.n_checked or not heads):
@@ -351,7 +355,7 @@ class TimelinePanel(QWidget):
         if left_out.frames:
             # On its own line, to be visible in a small window; the tool tip has the details.
             n, depth = left_out.frames, height_text(left_out.deepest, 2)
-            frames = counted(n, "frame")
+            frames = counted(n, "frame", "frames")
             if left_out.step > 1:
                 frames = say("{n} of {searched} searched", n=n, searched=left_out.searched)
             line = say("Not counted in {frames}, up to {depth}", frames=frames, depth=depth)

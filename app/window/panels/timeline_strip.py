@@ -309,7 +309,7 @@ class TimelineStrip(QWidget):
         if not len(self._times):
             text = "No motion"
         elif self._frame is None:
-            text = f"{counted(len(self._times), 'frame')}, none of them shown"
+            text = f"{counted(len(self._times), 'frame', 'frames')}, none of them shown"
         else:
             which, *facts = self._facts(self._frame)
             text = f"{which}: {', '.join(facts)}"

@@ -624,7 +624,7 @@ def test_what_another_run_left_is_neither_used_nor_lost(
     left = kept.read_bytes()
     result = lcollision("resolve", model_file, poses, "-o", out, "--metric", "latent")
     assert result.exit_code == 2
-    assert f"{kept} has poses of another run" in result.stderr
+    assert f"{kept} is of another run" in result.stderr
     assert kept.read_bytes() == left
     assert not out.exists()
     document = json.loads(left)
