@@ -382,7 +382,8 @@ def test_an_export_says_whether_the_mesh_collides(
         export_pose(document, tmp_path / "bad.obj")
     mesh = read_mesh(tmp_path / "bad.obj")
     n_pairs = len(document.model.detector.detect(mesh.vertices.astype(np.float32)).pairs)
-    assert told.args == [f"Exported bad.obj: {counted(n_pairs, 'pair', 'pairs')} of its triangles collide"]
+    pairs = counted(n_pairs, "pair", "pairs")
+    assert told.args == [f"Exported bad.obj: {pairs} of its triangles collide"]
     assert n_pairs > 0
 
 
