@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -148,7 +149,9 @@ def body_of_scene(
     """
     known_bodies = [*opened, *[None] * (len(scene.bodies) - len(opened))]
     pairs = list(zip(scene.bodies, known_bodies, strict=True))
-    bodies = [body or open_member(part.file) for part, body in pairs]
+    # Two members of one file are one body, which lists its near faces once.
+    open_once = cache(open_member)
+    bodies = [body or open_once(part.file) for part, body in pairs]
     names = unique_names(part.name or Path(part.file).stem for part in scene.bodies)
     first = bodies[0]
     members: list[SceneMember] = []
