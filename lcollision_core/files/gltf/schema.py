@@ -546,7 +546,7 @@ def _parsed(text: bytes) -> dict[str, Any]:
     except ValueError as error:
         raise MeshFileError("it contains no readable glTF description") from error
     asset = values.get("asset") if isinstance(values, dict) else None
-    if isinstance(asset, dict) and str(asset.get("version")).startswith("1."):
+    if isinstance(asset, dict) and str(asset.get("version")).partition(".")[0] == "1":
         raise _of_version_1()
     if b"null" in text:
         _remove_nulls(values)
@@ -607,7 +607,8 @@ def resource(uri: object, path: Path, most_bytes: int, what: str = "its buffer")
         return read_regular(file, most_bytes)
     except (OSError, ValueError, binascii.Error) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise MeshFileError.unreadable(f"{what} {quoted(uri)}", reason) from error
+        advice = "put it beside the file" * isinstance(error, FileNotFoundError)
+        raise MeshFileError.unreadable(f"{what} {quoted(uri)}", reason, advice) from error
 
 
 def _require_complete(document: GltfDocument) -> None:
