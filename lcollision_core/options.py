@@ -329,7 +329,7 @@ class ResolveOptions:
     largest_change : > 0, normalised: no vertex moves farther. If no free pose is that near, the
         result is the pose of least overlap. None accepts a free pose at any distance. Without
         `verify` there is no bound.
-    seed : >= 0, seed of the restarts
+    seed : >= 0, seed of the restarts and draws
 
     Raises
     ------

@@ -173,7 +173,8 @@ def resolve(
     larger margin; polish, for shallow contacts; start, a restart elsewhere; towards, from a free
     pose as near to the target as contacts allow (for characters, which have no predictor);
     push-out, moved out of contact by the joints, if that is nearer; walk-back, along the way to a
-    pose known to be free; soft, the least overlap within --soft.
+    pose known to be free; soft, the least overlap within --soft. A free pose of a character is then
+    drawn nearer: small random changes that stay free and move it less are kept.
 
     With --motion, colliding spans of whole motions are resolved, and everything else is unchanged.
     Where OUT is a .glb or .vrm file, that is the character's own file with all its clips, and new

@@ -32,14 +32,22 @@ from lcollision_core.resolve.problem import (
     single_torch_thread,
 )
 from lcollision_core.resolve.solvers import SqpBatch, polish, solve_nlopt
-from lcollision_core.resolve.steps import LeastOverlap, Standing, fall_back, pull_back, step_towards
+from lcollision_core.resolve.steps import (
+    LeastOverlap,
+    Standing,
+    draw_nearer,
+    fall_back,
+    pull_back,
+    step_towards,
+)
 from lcollision_core.sentences import joined, marked, say, say_number
 
 
 class Step(StrEnum):
     """The step of the ladder that a result comes from.
 
-    After each step the pose is pulled back towards the target: see `pull_back`.
+    After each step the pose is pulled back towards the target: see `pull_back`. Without a predictor
+    it is then drawn nearer: see `draw_nearer`.
     """
 
     UNCHANGED = "unchanged"
@@ -231,12 +239,17 @@ class Ladder:
         note. If no free pose was found at any distance, its note stays.
         """
         least = self._least
-        is_far = found is None or least.mean_change(found) > _FAR
-        if is_far and self.problem.model is None:
-            known = found if found is not None and least.is_within(found) else None
-            pushed = least.push_out(self._put_back, known)
-            if pushed is not None:
-                found, step = pushed, Step.PUSH_OUT
+        if self.problem.model is None:
+            if found is None or least.mean_change(found) > _FAR:
+                known = found if found is not None and least.is_within(found) else None
+                pushed = least.push_out(self._put_back, known)
+                if pushed is not None:
+                    found, step = pushed, Step.PUSH_OUT
+            if found is not None and not self.options.still_domains:
+                drawn = draw_nearer(
+                    self.check, self.problem, found, self.standing, self.options.seed
+                )
+                found = least.nearer(found, self._put_back(drawn))
         if found is not None and least.is_within(found):
             return found, step, None
         if found is not None and self._nearer is not None and least.is_within(self._nearer):

@@ -86,7 +86,7 @@ def test_a_learned_body_is_posed_by_its_codes(folder: Path) -> None:
     assert (folder / "out" / "tube.obj").is_file()
     dragger, hand = body.dragger(), int(rows.start + model.reference[:, 1].argmax())
     dragger.begin(result.latent, Grip.at(hand))
-    moved = dragger.move(body.decode(result.latent)[hand] + [0.0, 0.0, 9.0]).latent
+    moved = dragger.move(body.decode(result.latent)[hand] - [0.0, 9.0, 0.0]).latent
     assert body.codes_of_member("tube", moved - result.latent).any()
     assert not body.codes_of_member("hero", moved - result.latent).any()
 

@@ -12,7 +12,7 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.options import RuleOptions
 from lcollision_core.posing import DragOptions
 from lcollision_core.resolve import ResolveOptions, ResolveResult, Step
-from lcollision_core.resolve.steps import LeastOverlap
+from lcollision_core.resolve.steps import LeastOverlap, draw_nearer, fall_back
 from tests.core.brute_force import all_pairs
 from tests.rigged_shapes import rigged_body, skirted_body
 
@@ -141,6 +141,26 @@ def test_steps_out_of_contact_end_in_a_nearer_pose_than_is_known_or_none() -> No
     nearest = latent + 1e-6 * (far - latent)
     assert least.push_out(finish, nearest) is None
     assert finished == []
+
+
+@pytest.mark.parametrize("locked", [False, True])
+def test_draws_come_nearer_and_stay_free(locked: bool) -> None:
+    model = RigBody.of(skirted_body())
+    latent = sample_poses(model, 57, seed=11, colliding=True)[8]
+    domains = frozenset(range(model.space.n_domains // 2)) if locked else frozenset()
+    check = model.exact_check()
+    problem = model.resolver.problem(latent, ResolveOptions(locked_domains=domains))
+    free = fall_back(check, problem, np.atleast_2d(model.free_latent))
+    assert free is not None
+    drawn = draw_nearer(check, problem, free)
+    assert check.is_free(drawn)
+    target, before, after = check.decode(np.stack([latent, free, drawn]))
+    far, near = (np.linalg.norm(pose - target, axis=1).mean() for pose in (before, after))
+    assert near < 0.8 * far
+    assert (problem.low <= drawn).all()
+    assert (drawn <= problem.high).all()
+    assert np.array_equal(drawn, draw_nearer(check, problem, free))
+    assert not np.array_equal(drawn, draw_nearer(check, problem, free, seed=1))
 
 
 def test_a_largest_change_is_checked() -> None:
