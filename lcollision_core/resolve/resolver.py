@@ -245,9 +245,14 @@ class Ladder:
                 pushed = least.push_out(self._put_back, known)
                 if pushed is not None:
                     found, step = pushed, Step.PUSH_OUT
-            if found is not None and not self.options.still_domains:
+            if found is not None:
                 drawn = draw_nearer(
-                    self.check, self.problem, found, self.standing, self.options.seed
+                    self.check,
+                    self.problem,
+                    found,
+                    self.standing,
+                    self.options.still_domains,
+                    self.options.seed,
                 )
                 found = least.nearer(found, self._put_back(drawn))
         if found is not None and least.is_within(found):

@@ -462,6 +462,7 @@ def draw_nearer(
     problem: ResolveProblem,
     free: FloatArray,
     standing: Standing | None = None,
+    still_domains: frozenset[int] = frozenset(),
     seed: int = 0,
 ) -> FloatArray:
     """Draw poses near a free one, and go to each that is free and moves the vertices less.
@@ -474,6 +475,7 @@ def draw_nearer(
     check, problem : of the pose
     free : (D,) float64 array, collision-free
     standing : the parts that should stay on the ground: the body is shifted so with each draw
+    still_domains : body parts that go no farther from their places
     seed : of the draws
 
     Returns
@@ -488,9 +490,13 @@ def draw_nearer(
     original, decoded = check.decode(np.stack([target, free]))
     if standing is not None and not standing.can_shift(check):
         standing = None
+    still = np.isin(check.space.vertex_domain, sorted(still_domains))
+    slip = np.linalg.norm(decoded - original, axis=1)[still].max(initial=0.0)
 
     def cost_of(decoded: FloatArray) -> float:
         lengths = np.linalg.norm(decoded - original, axis=1)
+        if lengths[still].max(initial=0.0) > slip:
+            return np.inf
         cost = float(lengths.mean() + _FARTHEST * lengths.max())
         if standing is None:
             return cost
