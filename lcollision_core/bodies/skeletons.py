@@ -229,8 +229,10 @@ class Skeleton:
                 across = gap[0] if np.linalg.norm(gap[0]) > _APART * reach else gap.mean(axis=0)
                 tips = [self._tips[chain[-1]] for chain in chains]
                 ways = [_unit(tip - own[0]) for tip, own in zip(tips, places, strict=True)]
+                named = {self._named[joint] for chain in chains for joint in chain}
                 if (
                     n > 1
+                    and named != {Role.FACE}
                     and gaps.max() < _ALIKE * reach
                     and np.linalg.norm(across) > _APART * reach
                 ):
@@ -639,6 +641,28 @@ def front_of(
     return way / length if length > 0.5 * len(feet) * (1 - _PARALLEL) and feet else None
 
 
+def front_by_sides(
+    lefts: Sequence[int], origins: FloatArray, up: FloatArray, otherwise: FloatArray | None
+) -> FloatArray | None:
+    """Return the horizontal unit vector that has the joints named left on its left.
+
+    Parameters
+    ----------
+    lefts : J numbers, 1 for left by name, -1 for right, 0 for neither
+    origins : (J, 3) positions at rest
+    up : (3,) unit vector
+    otherwise : returned if the names give no sides
+    """
+    named = np.array(lefts)
+    if not ((named > 0).any() and (named < 0).any()):
+        return otherwise
+    left = origins[named > 0].mean(axis=0) - origins[named < 0].mean(axis=0)
+    front = np.cross(left, up)
+    length = float(np.linalg.norm(front))
+    is_clear = length > _MIDDLE * float(np.ptp(origins, axis=0).max())
+    return front / length if is_clear else otherwise
+
+
 def joint_axes(
     rig: Rig,
     roles: tuple[Role, ...],
@@ -792,6 +816,9 @@ def anatomy_of(character: Character) -> Anatomy:
             front = level / length
     animal = skeleton.front_of_four_legs() if person is None else None
     front = animal if front is None else front
+    if person is None:
+        # Like the sides below.
+        front = front_by_sides(lefts, rig.rest[:, :3, 3], up, front)
     if front is None:
         upwards = int(np.abs(up).argmax())
         front = front_direction(character.rest_vertices * up[upwards], upwards) * up[upwards]

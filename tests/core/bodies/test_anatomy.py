@@ -270,3 +270,39 @@ def test_eyebrows_and_a_ball_of_hair_are_of_one_head() -> None:
     anatomy = anatomy_of(character_from({**PERSON, **more}))
     assert set(anatomy.labels[-4:]) == {"Head"}
     assert set(anatomy.roles[-4:]) == {Role.FACE}
+
+
+def test_ears_above_short_legs_are_no_legs() -> None:
+    """Ears of a toy are as long as legs, and its body seems to hang from them."""
+    toy = dict(PERSON)
+    for side, sign in (("L", 1.0), ("R", -1.0)):
+        for name, parent, (x, y, z) in (
+            ("shin", "thigh", (0.1, 0.8, 0.01)),
+            ("foot", "shin", (0.1, 0.65, -0.01)),
+            ("toe", "foot", (0.1, 0.62, 0.03)),
+            ("ear1", "head", (0.1, 1.75, 0.0)),
+            ("ear2", "ear1", (0.12, 2.1, 0.0)),
+            ("ear3", "ear2", (0.14, 2.5, -0.1)),
+        ):
+            toy[f"{side} {name}"] = (
+                parent if parent == "head" else f"{side} {parent}",
+                ((sign * x, y, z)),
+            )
+    anatomy = anatomy_of(character_from(toy))
+    roles = dict(zip(toy, anatomy.roles, strict=True))
+    assert {roles[f"{side} ear{number}"] for side in "LR" for number in (1, 2, 3)} == {Role.FACE}
+    assert roles["L thigh"] is Role.THIGH
+    assert anatomy.front @ [0.0, 0.0, 1.0] > 0.99
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+def test_a_body_without_a_trunk_faces_where_its_names_of_sides_say(degrees: int) -> None:
+    walker = {
+        name: ("" if name == "hips" else parent, place)
+        for name, (parent, place) in PERSON.items()
+        if name == "hips" or name[2:] in ("thigh", "shin", "foot")
+    }
+    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    anatomy = anatomy_of(character_from(walker, turn=turn))
+    assert anatomy.front @ turn[:, 2] > 0.99
+    assert {anatomy.labels[list(walker).index("L thigh")]} == {"Left thigh"}
