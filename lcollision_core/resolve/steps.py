@@ -437,8 +437,9 @@ class LeastOverlap:
         )
 
 
-_DRAWS = 20_000_000
-"""Budget of draws near one pose, in faces of all drawn poses: about two seconds."""
+_DRAWS, _FAR = 20_000_000, 0.02
+"""Budget of draws near one pose, in faces of all drawn poses, about two seconds; and the normalised
+mean displacement from which all of it is used."""
 
 _LEAST_DRAWS, _MOST_DRAWS, _ROUND = 100, 3000, 200
 _GAIN = 0.01
@@ -491,7 +492,8 @@ def draw_nearer(
     if standing is not None and not standing.can_shift(check):
         standing = None
     still = np.isin(check.space.vertex_domain, sorted(still_domains))
-    slip = np.linalg.norm(decoded - original, axis=1)[still].max(initial=0.0)
+    lengths = np.linalg.norm(decoded - original, axis=1)
+    slip = lengths[still].max(initial=0.0)
 
     def cost_of(decoded: FloatArray) -> float:
         lengths = np.linalg.norm(decoded - original, axis=1)
@@ -514,9 +516,9 @@ def draw_nearer(
         is_better = tried_cost < limit and check.is_free(tried)
         return (tried, tried_cost) if is_better else (free, cost)
 
-    n_draws = int(np.clip(_DRAWS // check.space.topology.n_faces, _LEAST_DRAWS, _MOST_DRAWS))
+    most = np.clip(_DRAWS // check.space.topology.n_faces, _LEAST_DRAWS, _MOST_DRAWS)
     cost = before = cost_of(decoded)
-    for draw in range(n_draws):
+    for draw in range(int(most * min(1.0, lengths.mean() / _FAR))):
         if draw and draw % _ROUND == 0:
             if cost > (1.0 - _GAIN) * before:
                 break
