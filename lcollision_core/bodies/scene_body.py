@@ -738,7 +738,7 @@ class SceneBody(Body):
         from lcollision_core.options import ResolveOptions
 
         latent = target.copy()
-        options = ResolveOptions(clearance=check.clearance, largest_change=None)
+        options = ResolveOptions(clearance=check.clearance)
         for body in self._alone.values():
             found = body.resolver.resolve(target[body.codes], body.options(options))
             latent[body.codes] = found.latent
