@@ -38,7 +38,7 @@ SHOTS = Path(__file__).parents[2] / "out" / "screenshots"
 SIZE = (1280, 800)
 """Size of a window, in pixels."""
 
-PATIENCE = 120_000
+PATIENCE = 300_000
 """Timeout on a busy machine, in milliseconds."""
 
 SHARED: list[MainWindow] = []
