@@ -167,6 +167,23 @@ class Skeleton:
         up = self._up if trunk @ self._up > 0.5 else trunk
         return Person(roles, limbs, up, self._front(legs.across, up, roles, hinges))
 
+    def sides_of(self, person: Person, left: FloatArray) -> dict[int, Side]:
+        """Return the sides of limbs whose names agree, by their first joints, and of the trunk.
+
+        A limb is compared with the other of its pair, as the trunk may lean to a side at rest.
+        """
+        sides, roots = dict[int, Side](), list(person.limbs)
+        for pair in (roots[:2], roots[2:]):
+            chains = sorted(
+                (self._chain(root)[:3] for root in pair),
+                key=lambda chain: float((self._places[chain] @ left).mean()),
+            )
+            right, other = (sum(self._lefts[joint] for joint in chain) for chain in chains)
+            if right < 0 < other:
+                sides |= {above: Side.MIDDLE for chain in chains for above in self.above(chain[0])}
+                sides |= {chains[0][0]: Side.RIGHT, chains[1][0]: Side.LEFT}
+        return sides
+
     def front_of_four_legs(self) -> FloatArray | None:
         """Return where an animal faces whose two pairs of limbs hang from a level trunk.
 
@@ -541,19 +558,21 @@ def _repeats(rig: Rig, roles: Sequence[Role]) -> npt.NDArray[np.bool_]:
     return repeats
 
 
-def joint_sides(rig: Rig, left: FloatArray) -> list[Side]:
+def joint_sides(rig: Rig, left: FloatArray, known: Mapping[int, Side]) -> list[Side]:
     """Return the side of each of the rig's J joints, that on which its limb leaves the trunk.
 
     Parameters
     ----------
     left : (3,) unit vector
+    known : sides of some joints
     """
     places = rig.rest[:, :3, 3] @ left
     places = (places - np.median(places)) / float(np.ptp(rig.rest[:, :3, 3], axis=0).max() or 1.0)
     sides: list[Side] = []
-    for parent, place in zip(rig.parents.tolist(), places, strict=True):
+    for joint, (parent, place) in enumerate(zip(rig.parents.tolist(), places, strict=True)):
         side = Side.LEFT if place > _MIDDLE else Side.RIGHT if place < -_MIDDLE else Side.MIDDLE
         above = sides[parent] if parent >= 0 else Side.MIDDLE
+        side = known.get(joint, side)
         sides.append(side if above is Side.MIDDLE else above)
     return sides
 
@@ -659,8 +678,7 @@ def front_by_sides(
     left = origins[named > 0].mean(axis=0) - origins[named < 0].mean(axis=0)
     front = np.cross(left, up)
     length = float(np.linalg.norm(front))
-    is_clear = length > _MIDDLE * float(np.ptp(origins, axis=0).max())
-    return front / length if is_clear else otherwise
+    return front / length if length > _MIDDLE * np.ptp(origins, axis=0).max() else otherwise
 
 
 def joint_axes(
@@ -816,8 +834,7 @@ def anatomy_of(character: Character) -> Anatomy:
             front = level / length
     animal = skeleton.front_of_four_legs() if person is None else None
     front = animal if front is None else front
-    if person is None:
-        # Like the sides below.
+    if person is None:  # Like the sides below.
         front = front_by_sides(lefts, rig.rest[:, :3, 3], up, front)
     if front is None:
         upwards = int(np.abs(up).argmax())
@@ -835,11 +852,12 @@ def anatomy_of(character: Character) -> Anatomy:
         # It lies down, or the file is wrong about the up axis.
         own_up, own_front = person.up, person.front
     axes = joint_axes(rig, tuple(roles), rig.rest[:, :3, 3], directions, own_up, own_front)
-    sides = joint_sides(rig, np.cross(own_up, own_front))
-    for joint, left in enumerate(lefts):
+    left = np.cross(own_up, own_front)
+    sides = joint_sides(rig, left, skeleton.sides_of(person, left) if person else {})
+    for joint, named_left in enumerate(lefts):
         # Without a trunk in the middle, names are more reliable than positions.
-        if left and (person is None or joint in chosen_roles):
-            sides[joint] = Side.LEFT if left > 0 else Side.RIGHT
+        if named_left and (person is None or joint in chosen_roles):
+            sides[joint] = Side.LEFT if named_left > 0 else Side.RIGHT
     trusted_parts = [
         part if trusted and joint not in chosen_roles else None
         for joint, (part, trusted) in enumerate(zip(parts, by_name, strict=True))

@@ -14,7 +14,7 @@ from lcollision_core.bodies.rig_poses import HumanDraws, random_codes
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.bodies.skeletons import anatomy_of
 from lcollision_core.files import Character, read_character
-from lcollision_core.meshes.joint_kinds import Role
+from lcollision_core.meshes.joint_kinds import Role, Side
 from tests.skeletons import HORSE, PERSON, SNAKE, character_from
 
 FloatArray = npt.NDArray[np.float64]
@@ -306,3 +306,26 @@ def test_a_body_without_a_trunk_faces_where_its_names_of_sides_say(degrees: int)
     anatomy = anatomy_of(character_from(walker, turn=turn))
     assert anatomy.front @ turn[:, 2] > 0.99
     assert {anatomy.labels[list(walker).index("L thigh")]} == {"Left thigh"}
+
+
+def test_a_fighter_who_leans_at_rest_has_two_sides() -> None:
+    """Its legs and feet point to a side, and its trunk is in front of its limbs."""
+    trunk = ("hips", "spine", "chest", "neck", "head")
+    fighter = {
+        name: (parent, (x, y, z + 0.2 * (name in trunk)))
+        for name, (parent, (x, y, z)) in PERSON.items()
+    }
+    for side, sign in (("L", 1.0), ("R", -1.0)):
+        for name, parent, height, z in (
+            ("thigh", "hips", 0.95, 0.0),
+            ("shin", f"{side} thigh", 0.52, 0.01),
+            ("foot", f"{side} shin", 0.09, -0.02),
+        ):
+            x, _, z = Rotation.from_euler("y", 15, True).apply([sign * 0.1, 0.0, z])
+            fighter[f"{side} {name}"] = parent, (x, height, z)
+        fighter[f"{side} toe"] = f"{side} foot", (sign * 0.1 + 0.06, 0.02, 0.084)
+    anatomy = anatomy_of(character_from(fighter))
+    sides = dict(zip(fighter, anatomy.sides, strict=True))
+    assert {sides[f"L {name}"] for name in ("thigh", "foot", "upperarm", "hand")} == {Side.LEFT}
+    assert {sides[f"R {name}"] for name in ("thigh", "foot", "upperarm", "hand")} == {Side.RIGHT}
+    assert {sides[name] for name in trunk[:-1]} == {Side.MIDDLE}
