@@ -33,6 +33,7 @@ from lcollision_core.resolve.problem import (
 )
 from lcollision_core.resolve.solvers import SqpBatch, polish, solve_nlopt
 from lcollision_core.resolve.steps import (
+    FAR,
     LeastOverlap,
     Standing,
     draw_nearer,
@@ -139,9 +140,6 @@ _REMEMBERED, _POLISHED = 8, 3
 
 _ITERATIONS_ALONE = 60
 
-_FAR = 0.02
-"""Normalised mean displacement of a free pose beyond which a nearer one is looked for."""
-
 ALL_LOCKED = marked("all body parts are locked, so the pose was not changed; unlock one")
 """The note of a result whose pose has no movable code."""
 FEET_MOVED = marked("the feet moved, as keeping them on the ground moves the body too far")
@@ -240,7 +238,7 @@ class Ladder:
         """
         least = self._least
         if self.problem.model is None:
-            if found is None or least.mean_change(found) > _FAR:
+            if found is None or least.mean_change(found) > FAR:
                 known = found if found is not None and least.is_within(found) else None
                 pushed = least.push_out(self._put_back, known)
                 if pushed is not None:

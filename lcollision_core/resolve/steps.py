@@ -437,9 +437,11 @@ class LeastOverlap:
         )
 
 
-_DRAWS, _FAR = 20_000_000, 0.02
-"""Budget of draws near one pose, in faces of all drawn poses, about two seconds; and the normalised
-mean displacement from which all of it is used."""
+FAR = 0.02
+"""Normalised mean displacement of a free pose from which a nearer one is looked for at length."""
+
+_DRAWS = 20_000_000
+"""Budget of draws near a pose that is far, in faces of all drawn poses: about two seconds."""
 
 _LEAST_DRAWS, _MOST_DRAWS, _ROUND = 100, 3000, 200
 _GAIN = 0.01
@@ -468,14 +470,15 @@ def draw_nearer(
 ) -> FloatArray:
     """Draw poses near a free one, and go to each that is free and moves the vertices less.
 
-    A draw moves some codes towards Z* or at random. Slides along contacts, and
-    limbs put back one by one, end early where there is contact all round, as in clothes.
+    A draw moves some codes towards Z* or at random. Slides along contacts, and limbs put back one
+    by one, end early where there is contact all round, as in clothes. At the end, groups of codes
+    that gain little are put back to the bit.
 
     Parameters
     ----------
     check, problem : of the pose
     free : (D,) float64 array, collision-free
-    standing : the parts that should stay on the ground: the body is shifted so with each draw
+    standing : the parts that should stay on the ground; with each draw, the body is shifted there
     still_domains : body parts that go no farther from their places
     seed : of the draws
 
@@ -518,7 +521,7 @@ def draw_nearer(
 
     most = np.clip(_DRAWS // check.space.topology.n_faces, _LEAST_DRAWS, _MOST_DRAWS)
     cost = before = cost_of(decoded)
-    for draw in range(int(most * min(1.0, lengths.mean() / _FAR))):
+    for draw in range(int(most * min(1.0, lengths.mean() / FAR))):
         if draw and draw % _ROUND == 0:
             if cost > (1.0 - _GAIN) * before:
                 break
