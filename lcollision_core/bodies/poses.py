@@ -343,6 +343,9 @@ def _other_model(
     elif BETWEEN_BODIES in name:
         what = f"contains poses of the scene {name!r}, not of {model.name!r}"
         next_step = "name the scene's file, or its other bodies by --with"
+    elif "joints" in owner:
+        what = f"contains poses of the character {name!r}, not of {model.name!r}"
+        next_step = "use them with that character's file"
     else:
         what = (
             f"contains poses of the model {name!r}, not of {model.name!r}, and {name!r} is not "

@@ -168,9 +168,10 @@ def test_poses_name_the_character_that_they_belong_to(path: Path, tmp_path: Path
     body, other = opened(path), RigBody.of(rigged_body())
     poses = tmp_path / "poses.json"
     write_poses(poses, body, [NamedPose("rest", np.zeros(body.latent_size))])
-    with pytest.raises(OtherModelError, match="not among your models") as caught:
+    with pytest.raises(OtherModelError, match="poses of the character 'arm'") as caught:
         read_poses(poses, other)
     assert caught.value.model is None
+    assert caught.value.next_step == "use them with that character's file"
     remember_file(body, path)
     with pytest.raises(OtherModelError, match="poses of the character 'arm'") as caught:
         read_poses(poses, other)
