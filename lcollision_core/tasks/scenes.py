@@ -257,7 +257,8 @@ def read_scene_poses(
         ]
         name = f"scene {number + 1}" if n_poses > 1 else "scene"
         pose = NamedPose(name, body.joined_codes(codes))
-        poses.append(InputPose(" + ".join(sources) or body.name, pose))
+        source = " + ".join(sources) or body.name
+        poses.append(InputPose(f"{source}: {name}" if n_poses > 1 else source, pose))
     return poses
 
 

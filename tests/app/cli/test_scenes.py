@@ -61,6 +61,18 @@ def test_random_poses_of_a_scene_are_written_body_by_body(
     assert json.loads(info.stdout)["vertices"] == len(rest)
 
 
+def test_each_pose_of_a_body_in_a_scene_is_reported_by_name(
+    lcollision: Lcollision, hero: Path, tmp_path: Path
+) -> None:
+    poses, out = tmp_path / "poses.json", tmp_path / "out"
+    assert lcollision("sample", hero, "-n", 2, "-o", poses).exit_code == 0
+    scene = ["--with", hero, "--at", "hero 2=1.5,0,0"]
+    resolved = lcollision("resolve", hero, poses, *scene, "--json", "-o", f"{out}/")
+    rows = json.loads(resolved.stdout)
+    assert [row["source"] for row in rows] == [f"{poses}: scene {number}" for number in (1, 2)]
+    assert sorted(path.name for path in out.iterdir()) == ["scene 1", "scene 2"]
+
+
 @pytest.mark.slow
 def test_clips_play_together_from_when_they_are_said_to(
     lcollision: Lcollision, hero: Path, tmp_path: Path
