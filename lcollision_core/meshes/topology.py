@@ -216,7 +216,9 @@ class Topology:
     @cached_property
     def used_vertices(self) -> IntArray:
         """Indices of the vertices that some face uses."""
-        return np.unique(self.faces)
+        is_used = np.zeros(self.n_vertices, dtype=np.bool_)
+        is_used[self.faces] = True
+        return np.flatnonzero(is_used).astype(np.int32)
 
     @cached_property
     def unused_vertices(self) -> IntArray:
