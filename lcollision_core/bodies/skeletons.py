@@ -661,24 +661,26 @@ def front_of(
 
 
 def front_by_sides(
-    lefts: Sequence[int], origins: FloatArray, up: FloatArray, otherwise: FloatArray | None
-) -> FloatArray | None:
+    lefts: Sequence[int], origins: FloatArray, up: FloatArray, front: FloatArray
+) -> FloatArray:
     """Return the horizontal unit vector that has the joints named left on its left.
+
+    A front that agrees with the names is returned as it is: the axes of poses depend on it.
 
     Parameters
     ----------
     lefts : J numbers, 1 for left by name, -1 for right, 0 for neither
     origins : (J, 3) positions at rest
-    up : (3,) unit vector
-    otherwise : returned if the names give no sides
+    up, front : (3,) unit vectors; `front` is returned if the names give no sides
     """
     named = np.array(lefts)
     if not ((named > 0).any() and (named < 0).any()):
-        return otherwise
+        return front
     left = origins[named > 0].mean(axis=0) - origins[named < 0].mean(axis=0)
-    front = np.cross(left, up)
-    length = float(np.linalg.norm(front))
-    return front / length if length > _MIDDLE * np.ptp(origins, axis=0).max() else otherwise
+    way = np.cross(left, up)
+    length = float(np.linalg.norm(way))
+    is_known = length > _MIDDLE * np.ptp(origins, axis=0).max()
+    return way / length if is_known and way @ front < _SAME_WAY * length else front
 
 
 def joint_axes(
@@ -834,11 +836,11 @@ def anatomy_of(character: Character) -> Anatomy:
             front = level / length
     animal = skeleton.front_of_four_legs() if person is None else None
     front = animal if front is None else front
-    if person is None:  # Like the sides below.
-        front = front_by_sides(lefts, rig.rest[:, :3, 3], up, front)
     if front is None:
         upwards = int(np.abs(up).argmax())
         front = front_direction(character.rest_vertices * up[upwards], upwards) * up[upwards]
+    if person is None:  # Like the sides below.
+        front = front_by_sides(lefts, rig.rest[:, :3, 3], up, front)
     if animal is not None:
         roles = [
             Role.OTHER if role in _LIMBS and joint not in chosen_roles else role
