@@ -100,9 +100,15 @@ def one_line(text: str) -> str:
     return _NOT_IN_A_LINE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
-def fit_error(mean: float | None, most: float | None) -> str:
+def fit_error(mean: float | None, most: float | None, *, is_mirrored: bool = False) -> str:
     """Describe the fit error of a mesh, normalised; None for an exact pose."""
     fields = {"mean": 100.0 * (mean or 0.0), "most": 100.0 * (most or 0.0)}
+    if is_mirrored and (mean or 0.0) > _FAR:
+        return say(
+            "fit error of {mean:.3f} % of the body size, at most {most:.2f} %, which is large: the "
+            "body is not symmetric, or cannot take this pose",
+            **fields,
+        )
     if (mean or 0.0) > _FAR:
         return say(
             "fit error of {mean:.3f} % of the body size, at most {most:.2f} %, which is large: is "
@@ -154,7 +160,7 @@ def mirrored_text(mirrored: MirroredPose) -> str:
         state = say("free")
     if mirrored.restored:
         return say("restored to the unmirrored pose, {state}", state=state)
-    error = fit_error(mirrored.fit_error_mean, mirrored.fit_error_max)
+    error = fit_error(mirrored.fit_error_mean, mirrored.fit_error_max, is_mirrored=True)
     return say("mirrored with a {error}, {state}", error=error, state=state)
 
 

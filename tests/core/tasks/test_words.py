@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 
-from lcollision_core.tasks.words import height_text
+from lcollision_core.bodies.mirror import MirroredPose
+from lcollision_core.tasks.words import fit_error, height_text, mirrored_text
 
 
 @pytest.mark.parametrize(
@@ -21,3 +25,13 @@ def test_a_depth_above_zero_is_never_written_as_zero(
     distance: float, digits: int, text: str
 ) -> None:
     assert height_text(distance, digits) == text
+
+
+def test_a_mirror_image_far_off_does_not_doubt_the_body() -> None:
+    unused: Any = None
+    far = MirroredPose(np.zeros(1), None, 0.06, 0.2, False, 0, 0, 0, None, unused)
+    assert mirrored_text(far) == (
+        "mirrored with a fit error of 6.000 % of the body size, at most 20.00 %, which is large: "
+        "the body is not symmetric, or cannot take this pose, free"
+    )
+    assert fit_error(0.06, 0.2).endswith("is it this body, in the model's vertex order?")
