@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.rig_poses import HumanDraws, random_codes
 from lcollision_core.bodies.rig_space import RigPoseSpace
-from lcollision_core.bodies.skeletons import anatomy_of
+from lcollision_core.bodies.skeletons import anatomy_of, front_by_sides
 from lcollision_core.files import Character, read_character
 from lcollision_core.meshes.joint_kinds import Role, Side
 from tests.skeletons import HORSE, PERSON, SNAKE, character_from
@@ -329,3 +329,12 @@ def test_a_fighter_who_leans_at_rest_has_two_sides() -> None:
     assert {sides[f"L {name}"] for name in ("thigh", "foot", "upperarm", "hand")} == {Side.LEFT}
     assert {sides[f"R {name}"] for name in ("thigh", "foot", "upperarm", "hand")} == {Side.RIGHT}
     assert {sides[name] for name in trunk[:-1]} == {Side.MIDDLE}
+
+
+def test_a_front_that_agrees_with_the_names_of_sides_stays_to_the_bit() -> None:
+    """Poses of an earlier version belong to a rig of the same axes."""
+    places = np.array([[1.0, 0.0, 0.001], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    up, front = np.eye(3)[1], np.eye(3)[2]
+    assert front_by_sides([1, -1, 0], places, up, front) is front
+    assert front_by_sides([1, -1, 0], places, up, -front) @ front > 0.99
+    assert front_by_sides([1, 0, 0], places, up, front) is front
