@@ -62,6 +62,7 @@ class ResolvedMotion:
     touching : numbers of frames in `spans` that are free like the next, but with contact on the
         linear path of the vertices between; None if this was not checked
     unfinished : spans, or ends of spans, of which a stop has left frames colliding
+    rough : spans, or ends of spans, that a stop has left freed frame by frame, not yet smooth
     kept : frames that were not resolved, and why
     ground : how the motion stands on the ground of its scene; None if this was not measured
     """
@@ -73,6 +74,7 @@ class ResolvedMotion:
     standing: npt.NDArray[np.bool_]
     touching: tuple[int, ...] | None = None
     unfinished: tuple[range, ...] = ()
+    rough: tuple[range, ...] = ()
     kept: tuple[KeptSpan, ...] = ()
     ground: GroundReport | None = None
 
@@ -178,6 +180,7 @@ def resolve_motion(
             together = begin(each, job.part(), UNWATCHED)
             # Where bodies meet, poses that contacts allow came back, and ended in jerks.
             together.cuts_off = True
+            together.original, together.is_rough = motion, run.is_rough
             together.job = job.part(reports.of(len(bodies)))
             resolved = run.judged(together.result())
             if resolved is not None:
@@ -249,6 +252,8 @@ def _each_by_itself(
                 raise
             return
         codes[:, body.codes] = resolved.motion.codes
+        for span in resolved.rough:
+            run.is_rough[np.asarray(span) % run.n] = True
 
     with ThreadPoolExecutor(workers or available_cores(), "bodies of a motion") as pool:
         for _ in pool.map(resolve, range(len(bodies))):
@@ -270,11 +275,13 @@ class _Resolution:
     guard : judges the solved frames
     standing : (T, K)
     substeps : (n,) number of poses that are checked after each frame
+    original : `motion`, or for a scene of which each body was resolved before, that before
     codes, after : (n, D) and (n,), the current codes and whether they are free
     is_changed : (n,) frames of solved spans
     barred : (n,) frames that stay unchanged, unless some overlap can be removed
     reasons : why frames are barred
     unfinished : spans, or ends of spans, that were stopped
+    is_rough : (n,) changed frames that a stop left before they were smooth
     solved : for a span, the number of its frames in finished windows
     freed : for a span, the corrections that free frames of its unfinished window, by frame
     n_frames, n_done : number of frames of spans, and of those that are done
@@ -293,9 +300,11 @@ class _Resolution:
     guard: Guard
     standing: npt.NDArray[np.bool_]
     substeps: npt.NDArray[np.intp]
+    original: Motion = field(init=False)
     codes: FloatArray = field(init=False)
     after: npt.NDArray[np.bool_] = field(init=False)
     is_changed: npt.NDArray[np.bool_] = field(init=False)
+    is_rough: npt.NDArray[np.bool_] = field(init=False)
     barred: npt.NDArray[np.bool_] = field(init=False)
     reasons: dict[int, Reason] = field(default_factory=dict)
     unfinished: list[range] = field(default_factory=list)
@@ -358,8 +367,9 @@ class _Resolution:
             standing,
             np.full(n, options.substeps),
         )
+        self.original = motion
         self.codes, self.after = motion.codes[:n].copy(), before[:n].copy()
-        self.is_changed, self.barred = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+        self.is_changed, self.barred, self.is_rough = np.zeros((3, n), dtype=np.bool_)
         if options.frame.locked_domains or options.frame.locked_codes:
             self._bar_stuck(pairs)
         return self
@@ -408,6 +418,7 @@ class _Resolution:
     def _resolved(self, touching: tuple[int, ...] | None = None) -> ResolvedMotion:
         """Return the current state as a result."""
         again = np.arange(len(self.motion)) % self.n
+        moved = (self.codes != self.original.codes[: self.n]).any(axis=1)
         for span in runs(self.is_changed):
             if np.array_equal(
                 self.codes[span.start : span.stop], self.motion.codes[self._own(span)]
@@ -421,6 +432,7 @@ class _Resolution:
             self.standing,
             touching,
             tuple(self.unfinished),
+            tuple(runs((self.is_rough & moved)[again])),
             self._kept(),
         )
 
@@ -474,7 +486,7 @@ class _Resolution:
     def _put_back(self, span: range) -> None:
         own = self._own(span)
         self.codes[own], self.after[own] = self.motion.codes[own], self.before[own]
-        self.is_changed[own] = False
+        self.is_changed[own] = self.is_rough[own] = False
 
     def _solve_all(self, spans: Sequence[range], extra_clearance: float) -> None:
         """Solve spans in parallel; keep the finished part of a span that is stopped."""
@@ -492,6 +504,7 @@ class _Resolution:
                 if fixed := {at: freed[frame] for at, frame in enumerate(rest) if frame in freed}:
                     self._fit(rest, fixed)
                 own = self._own(rest)
+                self.is_rough[own] = self.is_changed[own]
                 self._bar(own, Reason.STOPPED)
                 if (self.wanted & ~(self.after & self._is_moved))[own].any():
                     self.unfinished.append(rest)

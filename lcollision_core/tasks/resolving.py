@@ -492,6 +492,7 @@ def resolve_one(
     kept_spans = [span.to_json(body.domain_names) for span in resolution.kept]
     row = _row(request, motion, before, after, report, kept_spans, start)
     row.output, row.collides_between = str(request.output.path), resolution.touching
+    row.rough_spans = [[span.start, span.stop - 1] for span in resolution.rough]
     row.contacts = contact_facts(resolution.motion, check)
     row.ground = ground_facts(body, resolution.motion)
     return MotionChange(

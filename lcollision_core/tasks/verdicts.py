@@ -103,6 +103,7 @@ class ResolvedClip:
 
     The output is "" if the motion was only checked. The contacts are a `ContactReport` for a
     retargeted motion, if known, else None. The ground is a `GroundReport` for a scene with one.
+    Rough spans, by first and last frame, were not smooth yet when the budget ended.
     """
 
     source: str
@@ -131,6 +132,7 @@ class ResolvedClip:
     seconds: float
     contacts: dict[str, Any] | None = None
     ground: dict[str, Any] | None = None
+    rough_spans: list[list[int]] = field(default_factory=list)
     error = ""
 
     @property

@@ -488,6 +488,14 @@ def resolved_clip_text(verdict: ResolvedClip) -> str:
     elif verdict.collides_between is not None and after == n:
         parts.append(say("no contact between them"))
     parts += [str(span["sentence"]) for span in verdict.kept_spans]
+    parts += [
+        say(
+            "frames {first} to {last} are not smooth, because the budget ended first",
+            first=first,
+            last=last,
+        )
+        for first, last in verdict.rough_spans
+    ]
     if verdict.largest_change:
         parts.append(
             say(

@@ -419,9 +419,11 @@ def test_what_a_budget_leaves_undone_stays_as_it_was_and_is_named(
     (span,) = row["kept_spans"]
     assert span["unchanged"]
     assert span["reason"] == "resolving was stopped before they were free"
+    assert row["rough_spans"] == []
     out.unlink()
     result = lcollision("resolve", swing, *options, "--budget", 1000)
     assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)[0]["rough_spans"] == []
 
 
 _STOP_AFTER_THE_FIRST = """

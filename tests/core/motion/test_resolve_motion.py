@@ -292,6 +292,7 @@ def test_a_span_that_is_stopped_keeps_the_best_found_by_then(
     stop = Stop()
     whole = resolve_motion(body.resolver, motion, UP, OPTIONS, 1, stop=stop)
     assert whole.after.all()
+    assert whole.rough == ()
     stop.last, stop.n_polls = share_of_polls * stop.n_polls, 0
     found = resolve_motion(body.resolver, motion, UP, OPTIONS, 1, stop=stop)
     check, codes = body.exact_check(), found.motion.codes
@@ -299,6 +300,8 @@ def test_a_span_that_is_stopped_keeps_the_best_found_by_then(
     assert found.before.sum() < found.after.sum()
     assert (found.after | ~found.before).all()
     assert found.after.all() == (not found.unfinished) == all_free
+    moved = np.flatnonzero((codes != motion.codes).any(axis=1))
+    assert [at for span in found.rough for at in span] == moved.tolist() != []
     assert {span.reason for span in found.kept} == (set() if all_free else {Reason.STOPPED})
     colliding = np.flatnonzero(~found.after)
     assert {at for span in found.kept for at in range(span.frames[0], span.frames[1] + 1)} == set(
