@@ -665,13 +665,11 @@ def front_by_sides(
 ) -> FloatArray:
     """Return the horizontal unit vector that has the joints named left on its left.
 
-    A front that agrees with the names is returned as it is: the axes of poses depend on it.
-
     Parameters
     ----------
     lefts : J numbers, 1 for left by name, -1 for right, 0 for neither
     origins : (J, 3) positions at rest
-    up, front : (3,) unit vectors; `front` is returned if the names give no sides
+    up, front : (3,) unit vectors; `front`, by which poses are stored, stays if no name contradicts
     """
     named = np.array(lefts)
     if not ((named > 0).any() and (named < 0).any()):
