@@ -595,9 +595,13 @@ def forest(path):
             name: rigged.bones[above] if above >= 0 else None
             for name, above in zip(rigged.bones, rigged.parents.tolist(), strict=True)
         }
-        lower_arm(armature)
-        before = check()
+        lower_arm(armature, 85.0)
+        # Arm and thigh cross and are locked, so that the trunk has to turn.
+        lower_arm(armature, -60.0, "LeftUpLeg")
         spine, arm = armature.pose.bones["Spine"], armature.pose.bones["LeftArm"]
+        for bone in (arm, armature.pose.bones["LeftUpLeg"]):
+            bone.lock_rotation = True, True, True
+        before = check()
 
         def shoulder(spine=spine, arm=arm):
             return spine.matrix.inverted() @ arm.matrix.to_translation()
