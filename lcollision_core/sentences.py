@@ -23,6 +23,11 @@ def say_number(number: int, one: str, several: str, **fields: object) -> str:
     return CATALOGUE.ngettext(one, several, number).format(n=number, **fields)
 
 
+def counted(number: int, noun: str, nouns: str) -> str:
+    """Return a number with its translated noun, "1 pair" or "2 pairs"."""
+    return f"{number} {CATALOGUE.ngettext(noun, nouns, number)}"
+
+
 def marked(sentence: str) -> str:
     """Return a sentence as it is, which `say` translates later."""
     return sentence

@@ -128,10 +128,8 @@ class MotionResolve(QObject):
             return "Stopped before a span of frames was resolved: the motion is as it was"
         if not found.spans and not found.kept:
             return "No frame collides"
-        n_left, before = (
-            int((~found.after).sum()),
-            counted(int((~found.before).sum()), "frame", "frames"),
-        )
+        n_left = int((~found.after).sum())
+        before = counted(int((~found.before).sum()), "frame", "frames")
         text = say("{frames} collided", frames=before)
         if self.is_ending:
             text = say("Stopped: {frames} collided", frames=before)

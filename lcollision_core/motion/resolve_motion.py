@@ -176,15 +176,17 @@ def resolve_motion(
         is_plain = motion.placements is None and motion.hidden is None and motion.contacts is None
         if len(bodies) > 1 and is_plain and run.wanted.any():
             reports = _Reports(job, len(bodies) + 1)
-            each = _each_by_itself(run, bodies, up, workers, reports)
+            each, is_rough = _each_by_itself(run, bodies, up, workers, reports)
             together = begin(each, job.part(), UNWATCHED)
             # Where bodies meet, poses that contacts allow came back, and ended in jerks.
             together.cuts_off = True
-            together.original, together.is_rough = motion, run.is_rough
             together.job = job.part(reports.of(len(bodies)))
-            resolved = run.judged(together.result())
+            both = together.result()
+            resolved = run.judged(both)
             if resolved is not None:
-                return resolved
+                is_rough[[frame for span in both.rough for frame in span]] = True
+                moved = (resolved.motion.codes != motion.codes).any(axis=1)
+                return replace(resolved, rough=tuple(runs(is_rough & moved)))
             run.done, run.keep = {}, None
         return run.result()
 
@@ -212,14 +214,15 @@ def _each_by_itself(
     up: npt.ArrayLike,
     workers: int | None,
     reports: _Reports,
-) -> Motion:
+) -> tuple[Motion, npt.NDArray[np.bool_]]:
     """Return the motion of a scene with the self-collisions of each body resolved.
 
-    Most collisions are within one body, and alone it is cheaper to decode, search and solve. Bodies
-    that a stop leaves unchecked stay unchanged.
+    Also return (T,) whether each frame is rough: see `ResolvedMotion`. Most collisions are within
+    one body, and alone it is cheaper to decode, search and solve. Bodies that a stop leaves
+    unchecked stay unchanged.
     """
     motion, options, space_at = run.motion, run.options, run.motion.space_at
-    codes = np.array(motion.codes)
+    codes, is_rough = np.array(motion.codes), np.zeros(len(motion), dtype=np.bool_)
 
     def resolve(number: int) -> None:
         body = bodies[number]
@@ -252,13 +255,12 @@ def _each_by_itself(
                 raise
             return
         codes[:, body.codes] = resolved.motion.codes
-        for span in resolved.rough:
-            run.is_rough[np.asarray(span) % run.n] = True
+        is_rough[[frame for span in resolved.rough for frame in span]] = True
 
     with ThreadPoolExecutor(workers or available_cores(), "bodies of a motion") as pool:
         for _ in pool.map(resolve, range(len(bodies))):
             pass
-    return replace(motion, codes=codes)
+    return replace(motion, codes=codes), is_rough
 
 
 @dataclass(eq=False)
@@ -275,13 +277,12 @@ class _Resolution:
     guard : judges the solved frames
     standing : (T, K)
     substeps : (n,) number of poses that are checked after each frame
-    original : `motion`, or for a scene of which each body was resolved before, that before
     codes, after : (n, D) and (n,), the current codes and whether they are free
     is_changed : (n,) frames of solved spans
     barred : (n,) frames that stay unchanged, unless some overlap can be removed
     reasons : why frames are barred
     unfinished : spans, or ends of spans, that were stopped
-    is_rough : (n,) changed frames that a stop left before they were smooth
+    is_rough : (n,) frames that a stop left before they were smooth
     solved : for a span, the number of its frames in finished windows
     freed : for a span, the corrections that free frames of its unfinished window, by frame
     n_frames, n_done : number of frames of spans, and of those that are done
@@ -300,7 +301,6 @@ class _Resolution:
     guard: Guard
     standing: npt.NDArray[np.bool_]
     substeps: npt.NDArray[np.intp]
-    original: Motion = field(init=False)
     codes: FloatArray = field(init=False)
     after: npt.NDArray[np.bool_] = field(init=False)
     is_changed: npt.NDArray[np.bool_] = field(init=False)
@@ -367,7 +367,6 @@ class _Resolution:
             standing,
             np.full(n, options.substeps),
         )
-        self.original = motion
         self.codes, self.after = motion.codes[:n].copy(), before[:n].copy()
         self.is_changed, self.barred, self.is_rough = np.zeros((3, n), dtype=np.bool_)
         if options.frame.locked_domains or options.frame.locked_codes:
@@ -418,7 +417,6 @@ class _Resolution:
     def _resolved(self, touching: tuple[int, ...] | None = None) -> ResolvedMotion:
         """Return the current state as a result."""
         again = np.arange(len(self.motion)) % self.n
-        moved = (self.codes != self.original.codes[: self.n]).any(axis=1)
         for span in runs(self.is_changed):
             if np.array_equal(
                 self.codes[span.start : span.stop], self.motion.codes[self._own(span)]
@@ -432,7 +430,7 @@ class _Resolution:
             self.standing,
             touching,
             tuple(self.unfinished),
-            tuple(runs((self.is_rough & moved)[again])),
+            tuple(runs((self.is_rough & self._is_moved)[again])),
             self._kept(),
         )
 
@@ -486,7 +484,7 @@ class _Resolution:
     def _put_back(self, span: range) -> None:
         own = self._own(span)
         self.codes[own], self.after[own] = self.motion.codes[own], self.before[own]
-        self.is_changed[own] = self.is_rough[own] = False
+        self.is_changed[own] = False
 
     def _solve_all(self, spans: Sequence[range], extra_clearance: float) -> None:
         """Solve spans in parallel; keep the finished part of a span that is stopped."""
@@ -504,7 +502,7 @@ class _Resolution:
                 if fixed := {at: freed[frame] for at, frame in enumerate(rest) if frame in freed}:
                     self._fit(rest, fixed)
                 own = self._own(rest)
-                self.is_rough[own] = self.is_changed[own]
+                self.is_rough[own] = True
                 self._bar(own, Reason.STOPPED)
                 if (self.wanted & ~(self.after & self._is_moved))[own].any():
                     self.unfinished.append(rest)

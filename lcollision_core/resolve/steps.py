@@ -152,22 +152,32 @@ def _slide(
 def _put_domains_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> FloatArray:
     """Return each group of codes to Z* where the pose stays free, the largest gain first."""
 
-    def put_back(codes: npt.NDArray[np.intp]) -> FloatArray:
-        latent = free.copy()
-        latent[codes] = problem.target[codes]
-        return latent
+    def away(codes: npt.NDArray[np.intp]) -> float:
+        return float(problem.distance(_with_codes(free, codes, problem.target)))
 
-    groups = np.split(np.arange(len(free)), np.cumsum(check.space.group_sizes)[:-1])
-    for codes in sorted(groups, key=lambda codes: float(problem.distance(put_back(codes)))):
+    for codes in sorted(_code_groups(check), key=away):
         problem.deadline.poll()
         if problem.deadline.expired:
             break
         # If the metric couples groups, putting one back alone may increase the distance.
-        tried = put_back(codes)
+        tried = _with_codes(free, codes, problem.target)
         gain = problem.distance(free) - problem.distance(tried)
         if gain > _SETTLED * problem.distance(free) and check.is_free(tried):
             free = tried
     return free
+
+
+def _code_groups(check: ExactCheck) -> list[npt.NDArray[np.intp]]:
+    """Return the indices of each group of codes, the shapes with the last."""
+    space = check.space
+    return np.split(np.arange(len(space.low)), np.cumsum(space.group_sizes)[:-1])
+
+
+def _with_codes(latent: FloatArray, codes: npt.NDArray[np.intp], other: FloatArray) -> FloatArray:
+    """Return a (D,) pose with some codes of another."""
+    changed = latent.copy()
+    changed[codes] = other[codes]
+    return changed
 
 
 _WAYS = 4
@@ -542,14 +552,11 @@ def draw_nearer(
             tried[chosen] += generator.choice(_SIDEWAYS) * generator.standard_normal(len(chosen))
         free, cost = better(np.clip(tried, problem.low, problem.high), cost)
     limit = (1.0 + _SPARED) * cost
-    groups = np.split(np.arange(len(free)), np.cumsum(check.space.group_sizes)[:-1])
-    for codes in sorted(
-        groups, key=lambda codes: float(np.abs(free - target)[codes].max(initial=0.0))
-    ):
+    turned = np.abs(free - target)
+    for codes in sorted(_code_groups(check), key=lambda codes: turned[codes].max(initial=0.0)):
+        problem.deadline.poll()
         if (free[codes] != target[codes]).any():
-            tried = free.copy()
-            tried[codes] = target[codes]
-            free, cost = better(tried, limit)
+            free, cost = better(_with_codes(free, codes, target), limit)
     return free
 
 

@@ -11,8 +11,8 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from lcollision_core import sentences
 from lcollision_core.errors import listed
+from lcollision_core.sentences import counted as counted
 from lcollision_core.sentences import joined as joined
 from lcollision_core.sentences import say as say
 from lcollision_core.sentences import say_number as say_number
@@ -67,11 +67,6 @@ def least_distance_words(least: float | None, clearance: float) -> str:
     if least < 0.0:
         return say("penetrating by up to {depth}", depth=share_text(-least))
     return say("least distance {distance}", distance=share_text(least))
-
-
-def counted(number: int, noun: str, nouns: str) -> str:
-    """Format a number with its translated noun, "1 pair" or "2 pairs"."""
-    return f"{number} {sentences.CATALOGUE.ngettext(noun, nouns, number)}"
 
 
 def grouped(number: int) -> str:

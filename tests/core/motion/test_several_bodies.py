@@ -79,6 +79,8 @@ def test_a_stop_keeps_what_was_freed_in_each_body() -> None:
     result = resolve_motion(body.resolver, motion, body.up, job=Job(report), stop=stop)
     assert stop.cancelled
     assert result.unfinished
+    moved = (result.motion.codes != motion.codes).any(axis=1)
+    assert all(moved[span].all() for span in map(list, result.rough))
     pairs = [
         [_pairs(body, of, frame) for frame in range(len(motion))] for of in (motion, result.motion)
     ]
