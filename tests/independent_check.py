@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 Array = npt.NDArray[np.float64]
 
@@ -92,12 +93,13 @@ class IndependentRules:
         self._ignored, self._left_out = rules["ignored"], rules["left_out"]
         self._tolerated_pairs = [(a, b, d * size) for a, b, d in rules["tolerated_pairs"]]
         self._of_rest = None if rules["rest_exclusion"] is None else rules["rest_exclusion"] * size
-        self._neighbours: dict[int, set[int]] = {}
+        self._edges: dict[int, dict[int, float]] = {}
         self._faces_of: dict[int, set[int]] = {}
         for face, (a, b, c) in enumerate(self._corners):
             for i, j in ((a, b), (b, c), (c, a)):
-                self._neighbours.setdefault(i, set()).add(j)
-                self._neighbours.setdefault(j, set()).add(i)
+                length = float(np.linalg.norm(rest[i] - rest[j]))
+                self._edges.setdefault(i, {})[j] = length
+                self._edges.setdefault(j, {})[i] = length
                 self._faces_of.setdefault(i, set()).add(face)
         self._touched: dict[int, set[int]] = {}
         for a, b in touching_at_rest:
@@ -119,12 +121,13 @@ class IndependentRules:
             self._fold_joints.append((middles.mean(axis=0), 2.0 * thickness))
             for vertex in {int(v) for face in about for v in faces[face]}:
                 own[vertex] = min(2.0 * thickness, own.get(vertex, np.inf))
+        if not own:
+            return dict.fromkeys(range(len(rest)), np.inf)
         known = np.array(sorted(own))
-        nearest = (
-            known[np.linalg.norm(rest[known] - place, axis=1).argmin()] if len(known) else -1
-            for place in rest
-        )
-        return {vertex: own.get(int(at), np.inf) for vertex, at in enumerate(nearest)}
+        # Few at a time, as their distances take memory.
+        parts = np.array_split(rest, 1 + len(rest) // 1000)
+        nearest = np.concatenate([known[cdist(part, rest[known]).argmin(axis=1)] for part in parts])
+        return {vertex: own[int(at)] for vertex, at in enumerate(nearest)}
 
     def _may_fold(self, a: int, b: int) -> bool:
         """Whether some corners of both faces are near along the surface and in space at rest."""
@@ -201,10 +204,9 @@ class IndependentRules:
             if vertex in reached:
                 continue
             reached.add(vertex)
-            for other in self._neighbours[vertex] - reached:
-                further = length + float(np.linalg.norm(self._rest[vertex] - self._rest[other]))
-                if further <= radius:
-                    heapq.heappush(waiting, (further, other))
+            for other, edge in self._edges[vertex].items():
+                if other not in reached and length + edge <= radius:
+                    heapq.heappush(waiting, (length + edge, other))
         return reached
 
 
