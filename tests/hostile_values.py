@@ -130,3 +130,9 @@ def damaged_glbs(whole: bytes, n: int, seed: int) -> Iterator[bytes]:
         for place in generator.integers(0, end, generator.integers(1, 5)):
             data[place] = generator.integers(256)
         yield bytes(data if number % 5 else data[: int(generator.integers(1, len(data)))])
+
+
+def without_file(path: Path) -> Path:
+    """Delete a file that is to be written again: some file systems flush one that is truncated."""
+    path.unlink(missing_ok=True)
+    return path
