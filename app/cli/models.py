@@ -205,7 +205,7 @@ def domains(
 ) -> None:
     """List the domains of a model or a character, rename them, or set the roles of its joints."""
     from lcollision_core.bodies import open_body
-    from lcollision_core.bodies.skeletons import role_name
+    from lcollision_core.bodies.anatomy import role_name
     from lcollision_core.tasks.changing import change_body, set_joint_roles
 
     renamings: dict[int, str] = {}

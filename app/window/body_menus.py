@@ -142,7 +142,7 @@ class BodyMenus(QObject):
 
     def _add_roles(self, menu: ListMenu, domain: int | None, code: int | None) -> None:
         """Add the roles of a character's joint: the slider's, or the only one of a body part."""
-        from lcollision_core.bodies.skeletons import ROLE_NAMES, role_name
+        from lcollision_core.bodies.anatomy import ROLE_NAMES, role_name
 
         model = self._document.model
         space = model.joints

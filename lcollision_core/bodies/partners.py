@@ -18,10 +18,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.bodies.body import Body
-from lcollision_core.bodies.rig_body import RigBody
-from lcollision_core.bodies.rig_space import RigPoseSpace
-from lcollision_core.bodies.skeletons import (
+from lcollision_core.bodies.anatomy import (
     Anatomy,
     joint_roles,
     limb_children,
@@ -30,6 +27,9 @@ from lcollision_core.bodies.skeletons import (
     role_name,
     role_of_word,
 )
+from lcollision_core.bodies.body import Body
+from lcollision_core.bodies.rig_body import RigBody
+from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.bodies.standing_pose import common_ancestor
 from lcollision_core.bundled import user_folder
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError

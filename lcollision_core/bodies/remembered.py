@@ -56,7 +56,7 @@ class RememberedChoices:
     file : path that it was last opened from
     rules, domain_names, domain_colours, domain_order : see `ModelCard`
     up_axis : 0, 1 or 2, if the file's is wrong
-    roles : pairs of a joint's name and its role, of `skeletons.ROLE_NAMES`
+    roles : pairs of a joint's name and its role, of `anatomy.ROLE_NAMES`
     mesh : digest of its faces, to recognise meshes of its poses
     offer_declined : True if the user does not want the rules proposed from its poses
     """

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.bodies.anatomy import Anatomy, anatomy_of, axes_of, limb_children, rig_of
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.partners import (
     ALIGNED,
@@ -28,7 +29,6 @@ from lcollision_core.bodies.partners import (
 )
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
-from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, axes_of, limb_children, rig_of
 from lcollision_core.bodies.standing_pose import (
     ReposedMotion,
     in_world,

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from lcollision_core.bodies.anatomy import ROLE_NAMES, joint_parts
 from lcollision_core.bodies.body import Body, ModelCard, read_only
 from lcollision_core.bodies.mirror import (
     JointSides,
@@ -35,7 +36,6 @@ from lcollision_core.bodies.names import (
 )
 from lcollision_core.bodies.rig_poses import HumanDraws, StarterPose, random_codes, starter_poses
 from lcollision_core.bodies.rig_space import ROOT_CODES, SHIFTS, RigPoseSpace
-from lcollision_core.bodies.skeletons import ROLE_NAMES, joint_parts
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.contact.exclusions import near_pairs_estimate
 from lcollision_core.contact.propose import patches_about
@@ -545,7 +545,7 @@ class RigBody(Body):
 
         Parameters
         ----------
-        chosen : `skeletons.ROLE_NAMES` entries by joint name
+        chosen : `anatomy.ROLE_NAMES` entries by joint name
 
         Raises
         ------

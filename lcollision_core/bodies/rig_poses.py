@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from lcollision_core.bodies.anatomy import limb_children
 from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
-from lcollision_core.bodies.skeletons import limb_children
 from lcollision_core.bundled import bundled_table
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.scene.transforms import from_rotation_vectors

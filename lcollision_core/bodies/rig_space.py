@@ -13,8 +13,8 @@ import numpy.typing as npt
 import scipy
 
 from lcollision_core.bodies import rig_kernels
+from lcollision_core.bodies.anatomy import Anatomy, anatomy_of, axes_of, joint_limits, rig_of
 from lcollision_core.bodies.rig_kernels import Influences, JointFrames, Motions, PoseShapes
-from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, axes_of, joint_limits, rig_of
 from lcollision_core.errors import ShapeError
 from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.scene.transforms import (

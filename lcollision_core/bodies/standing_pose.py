@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lcollision_core.bodies.skeletons import anatomy_of, axes_of, joint_roles, limb_children, rig_of
+from lcollision_core.bodies.anatomy import anatomy_of, axes_of, joint_roles, limb_children, rig_of
 from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.motion.skeleton import SkeletonMotion, least_turns
 from lcollision_core.meshes.joint_kinds import Role, Side, part_names

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.bodies import RigBody, poses_by_rig, rest_pose_set
+from lcollision_core.bodies.anatomy import rig_of
 from lcollision_core.bodies.remembered import with_remembered
 from lcollision_core.bodies.rig_body import MOST_NEAR_PAIRS
-from lcollision_core.bodies.skeletons import rig_of
 from lcollision_core.contact import CollisionDetector, touching_patches
 from lcollision_core.contact.exclusions import near_pairs_estimate
 from lcollision_core.errors import LCollisionError

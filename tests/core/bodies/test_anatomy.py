@@ -10,9 +10,9 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lcollision_core.bodies.anatomy import anatomy_of, front_by_sides
 from lcollision_core.bodies.rig_poses import HumanDraws, random_codes
 from lcollision_core.bodies.rig_space import RigPoseSpace
-from lcollision_core.bodies.skeletons import anatomy_of, front_by_sides
 from lcollision_core.files import Character, read_character
 from lcollision_core.meshes.joint_kinds import Role, Side
 from tests.skeletons import HORSE, PERSON, SNAKE, character_from

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lcollision_core.bodies.skeletons import joint_limits, joint_roles
+from lcollision_core.bodies.anatomy import joint_limits, joint_roles
 from lcollision_core.meshes.joint_kinds import Role
 from tests.rigged_shapes import rigged_tube
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies.skeletons import joint_parts
+from lcollision_core.bodies.anatomy import joint_parts
 from lcollision_core.errors import CancelledError, MeshFileError, MissingExtraError
 from lcollision_core.files import read_character, read_mesh, read_pose_set
 from lcollision_core.files.motion.caches import write_point_cache

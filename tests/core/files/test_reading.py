@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies.anatomy import joint_parts, joint_roles
 from lcollision_core.bodies.rig_space import RigPoseSpace
-from lcollision_core.bodies.skeletons import joint_parts, joint_roles
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files import Character, Rig, read_character
 from lcollision_core.files.scene_files import open_scene
