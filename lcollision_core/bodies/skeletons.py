@@ -267,6 +267,8 @@ class Skeleton:
             or abs(_unit(legs.across) @ _unit(arms.across)) < 0.8
             or abs(_unit(legs.across) @ way) > 0.4
             or self._overlap(legs, arms)
+            # An animal's second legs.
+            or (self._names_of(arms) & {*LEG} and not self._names_of(arms) & {*ARM})
         ):
             return 0.0
         roots = [chain[0] for pair in (legs, arms) for chain in pair.chains]
@@ -276,9 +278,12 @@ class Skeleton:
             any(len(self._children[joint]) > 2 for joint in chain) for chain in arms.chains
         )
         for pair, kinds in ((legs, LEG), (arms, ARM)):
-            hints = {self._named[joint] for chain in pair.chains for joint in chain}
-            score += 0.1 * len(hints.intersection(kinds))
+            score += 0.1 * len(self._names_of(pair).intersection(kinds))
         return score + 1.0
+
+    def _names_of(self, pair: _Pair) -> set[Role]:
+        """Return the roles by name along both branches."""
+        return {self._named[joint] for chain in pair.chains for joint in chain}
 
     def _head_chain(self, arms: _Pair, up: FloatArray) -> list[int]:
         """Return the joints of neck and head, which continue the trunk between the arms."""

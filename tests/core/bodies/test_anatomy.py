@@ -15,7 +15,7 @@ from lcollision_core.bodies.rig_poses import HumanDraws, random_codes
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.files import Character, read_character
 from lcollision_core.meshes.joint_kinds import Role, Side
-from tests.skeletons import HORSE, PERSON, SNAKE, character_from
+from tests.skeletons import HORSE, PERSON, SNAKE, both_sides, character_from
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -166,6 +166,32 @@ def test_an_animal_has_no_knees_of_a_person(renamed) -> None:  # type: ignore[no
     legs = [joint for joint, name in enumerate(HORSE) if name[0] in "LR"]
     assert np.abs(HumanDraws(space).limits[legs]).max() < np.radians(31.0)
     np.testing.assert_allclose(space.front, [0.0, 0.0, 1.0], atol=0.1)
+
+
+def test_the_bent_hind_legs_of_a_rat_are_no_arms() -> None:
+    """They are aside of a trunk from which the forelegs hang."""
+    rat = {
+        "body": ("", (0.0, 0.9, 0.0)),
+        "shoulders": ("body", (0.0, 1.3, 0.4)),
+        "neck": ("shoulders", (0.0, 1.3, 0.8)),
+        "head": ("neck", (0.0, 1.4, 1.3)),
+        **both_sides(
+            [
+                ("FrontLeg", "body", (0.15, 1.1, 0.5)),
+                ("FrontUpLeg", "FrontLeg", (0.45, 1.1, 0.5)),
+                ("FrontLowLeg", "FrontUpLeg", (0.45, 0.3, 0.8)),
+                ("FrontFoot", "FrontLowLeg", (0.45, 0.05, 1.2)),
+                ("BackLeg", "body", (0.2, 1.2, -0.7)),
+                ("BackUpLeg", "BackLeg", (0.55, 1.2, -0.7)),
+                ("BackLowLeg", "BackUpLeg", (0.55, 0.95, -1.3)),
+                ("BackFoot", "BackLowLeg", (0.55, 0.05, -1.4)),
+            ]
+        ),
+    }
+    anatomy = anatomy_of(character_from(rat))
+    assert not {Role.FOREARM, Role.HAND, Role.SHIN}.intersection(anatomy.roles)
+    assert "four legs" in anatomy.notes[0]
+    np.testing.assert_allclose(anatomy.front, [0.0, 0.0, 1.0], atol=0.1)
 
 
 def test_what_is_not_known_is_said_and_turns_little() -> None:
