@@ -1,7 +1,8 @@
 """Resolve on colliding poses, by solver, against bisection without learning.
 
 For a character, which has no predictor, the steps of Resolve run once on each pose, and the
-results are checked by all pairs of faces, without a tree.
+results are checked by all pairs of faces, without a tree. Beside them stand the ends of solid drags
+to the same poses, the nearest of those from all starter poses.
 
 Each solver runs twice on each pose, on one core: alone, for the paper's figures of merit (whether
 its point is feasible for the classifier, and how much of the exact energy it removes), and with
@@ -9,7 +10,7 @@ the whole ladder, for time, distances and the exact check.
 
 The fields of a row, means over the poses:
 
-solver : the name of a `Solver`, "bisection", or "steps" for a character
+solver : the name of a `Solver`, "bisection", or "drags" and "steps" for a character
 poses : colliding poses that were resolved
 median_ms, p95_ms : of a whole resolve, on one core
 feasible_rate : of the poses that the predictor calls colliding, the share that the solver alone
@@ -44,6 +45,7 @@ from lcollision_core.files import PoseSet
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.joint_kinds import Role
+from lcollision_core.posing import DragOptions
 from lcollision_core.resolve import ResolveOptions, ResolveResult, Step
 
 FloatArray = npt.NDArray[np.float64]
@@ -52,6 +54,9 @@ BASELINE = "bisection"
 """Bisection of the segment to the first pose stored as free: no learning."""
 
 HALVINGS = 12
+
+_EVENTS, _MOST_EVENTS = 20, 60
+"""Events in which a drag's target goes from the start to the end, and most events of a drag."""
 
 _COLOUR = (18, 64, 133)
 _MARKER_PIXELS = 30
@@ -182,26 +187,78 @@ def score_baseline(model: Body, poses: CollidingPoses, clearance: float = 0.0) -
                 free = middle
         seconds.append(time.perf_counter() - start)
         latents.append(free)
-    moved = np.stack(latents) - poses.latents
-    distances = [
-        np.linalg.norm(model.decode(free, 1) - model.decode(target, 1), axis=1).mean()
-        for free, target in zip(latents, poses.latents, strict=True)
+    return _reached_row(BASELINE, model, poses, seconds, latents, clearance)
+
+
+def score_drags(
+    model: Body, poses: CollidingPoses, options: ResolveOptions, job: Job = UNWATCHED
+) -> Row:
+    """Drag a character's codes to all poses without passing through itself, as by sliders.
+
+    Each drag starts from every free starter pose and the rest pose; the nearest end counts.
+
+    Parameters
+    ----------
+    options : with the clearance to keep
+    job : reports poses
+
+    Raises
+    ------
+    CancelledError : the job was cancelled.
+    """
+    check, dragger = model.exact_check(clearance=options.clearance), model.dragger()
+    starts = [np.zeros(model.latent_size), *(pose.codes for pose in model.starter_poses)]
+    starts = [start for start in starts if check.is_free(start)]
+    kept = DragOptions(clearance=options.clearance)
+    seconds, ends = [], []
+    for target in poses.latents:
+        began = time.perf_counter()
+        reached = []
+        for start in starts:
+            step = dragger.begin(start, None, options=kept)
+            for event in range(_MOST_EVENTS):
+                share = min(1.0, (event + 1) / _EVENTS)
+                step = dragger.move(start + share * (target - start))
+                if share == 1.0 and step.settled:
+                    break
+            reached.append(step.latent)
+        seconds.append(time.perf_counter() - began)
+        moved = model.decode(np.stack(reached), 1) - model.decode(target, 1)
+        ends.append(reached[int(np.linalg.norm(moved, axis=2).mean(axis=1).argmin())])
+        job.report(len(ends), len(poses.latents))
+    row = _reached_row("drags", model, poses, seconds, ends, options.clearance)
+    return row | {"confirmed_free_rate": None}
+
+
+def _reached_row(
+    name: str,
+    model: Body,
+    poses: CollidingPoses,
+    seconds: Sequence[float],
+    ends: Sequence[FloatArray],
+    clearance: float,
+) -> Row:
+    """Return the row of a method that goes from free poses towards those to resolve."""
+    moved = np.stack(ends) - poses.latents
+    lengths = [
+        np.linalg.norm(model.decode(end, 1) - model.decode(target, 1), axis=1) / model.body_size
+        for end, target in zip(ends, poses.latents, strict=True)
     ]
     return {
-        "solver": BASELINE,
-        "poses": len(latents),
+        "solver": name,
+        "poses": len(ends),
         "median_ms": _milliseconds(seconds, 0.5),
         "p95_ms": _milliseconds(seconds, 0.95),
         "feasible_rate": None,
-        "exactly_free_rate": 1.0
-        - float(_are_colliding(model, np.stack(latents), clearance).mean()),
+        "exactly_free_rate": 1.0 - float(_are_colliding(model, np.stack(ends), clearance).mean()),
         "free_before_walk_back": None,
         "energy_decrease": None,
         "latent_distance": float(
             (np.linalg.norm(moved, axis=1) / np.linalg.norm(poses.latents, axis=1)).mean()
         ),
-        "vertex_distance": float(np.mean(distances)) / model.body_size,
+        "vertex_distance": float(np.mean(lengths)),
         **dict.fromkeys(_END),
+        "largest_change": float(np.max(lengths)),
     }
 
 

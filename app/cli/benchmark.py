@@ -156,6 +156,7 @@ def resolve(
         real_poses,
         sampled_poses,
         score_baseline,
+        score_drags,
         score_solver,
         score_steps,
     )
@@ -183,6 +184,9 @@ def resolve(
         rows.append(score_baseline(model, poses, clearance))
         if not model.has_predictor:
             rows[0]["confirmed_free_rate"] = None
+            if made:
+                with progress_bar("Dragging", job) as bar:
+                    rows.append(score_drags(model, poses, options, bar))
             with progress_bar("Resolving", job) as bar:
                 rows.append(score_steps(model, poses, options, bar))
         else:
