@@ -80,7 +80,11 @@ def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int],
         row, pairs = np.nonzero(are_faces)[0], both[are_faces].astype(np.int32)
         share = faces[pairs[:, 0], :, None] == faces[pairs[:, 1], None, :]
         apart = ~share.any(axis=(1, 2))
-        counts = detector.rules_of(pairs[apart], np.ones(int(apart.sum()))) == 0
+        # Each pair of faces comes from several candidates.
+        keys = np.sort(pairs[apart], axis=1) @ np.array([len(faces), 1], np.int64)
+        keys, key_of = np.unique(keys, return_inverse=True)
+        once = np.stack(np.divmod(keys, len(faces)), axis=1).astype(np.int32)
+        counts = (detector.rules_of(once, np.ones(len(once))) == 0)[key_of]
         return [candidates[at] for at in np.unique(row[apart][counts])]
 
     # Skip most pairs near at rest, by single vertices; the rules decide on the rest.
