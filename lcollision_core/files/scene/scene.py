@@ -396,7 +396,10 @@ def shown_scene(scene: Scene) -> Scene:
 
 
 def _revealed(scene: Scene, node: int) -> Scene:
-    """Place a node and its descendants as in a clip if only the rest pose hides it by scale."""
+    """Place a node and its descendants as in a clip if only the rest pose hides it by scale.
+
+    Joints below a first one are placed as they were bound, as the clip may bend them.
+    """
     rest = scene.rest.transforms
     parent = int(scene.parents[node])
     above = np.eye(4) if parent < 0 else rest[0, parent]
@@ -426,9 +429,14 @@ def _revealed(scene: Scene, node: int) -> Scene:
         if scene.parents[other] in below:
             below.append(other)
     placed = rest.copy()
-    placed[0, below] = above @ np.linalg.solve(_above(frame[None], parent), frame[below])
+    shown = _as_bound(scene, frame, below)
+    placed[0, below] = above @ np.linalg.solve(_above(frame[None], parent), shown[below])
     parts = tuple(_wound(part, rest[0], placed[0], below) for part in scene.parts)
-    names = [part.mesh for part in parts if not set(part.bones.tolist()).isdisjoint(below)]
+    names = [
+        part.mesh
+        for part in parts
+        if not set(part.bones[part.bone_of[part.weights > 0.0]].tolist()).isdisjoint(below)
+    ]
     note = f"hidden at rest by its scale, shown as in the clip {clip_name!r}"
     joints = {bone for part in parts if part.is_skinned for bone in part.bones.tolist()}
     if not joints.isdisjoint(lineage(scene.parents, node)[1:]):
@@ -442,6 +450,29 @@ def _revealed(scene: Scene, node: int) -> Scene:
         notes=(*scene.notes, left_out_note(note, names)),
         revealed=(*scene.revealed, *below),
     )
+
+
+def _as_bound(scene: Scene, frame: FloatArray, nodes: Sequence[int]) -> FloatArray:
+    """Return a frame in which joints among some nodes lie as bound, relative to the first of them.
+
+    Parameters
+    ----------
+    frame : (n, 4, 4) transforms of all nodes; other nodes move with their parents
+    nodes : a node and its descendants, parents first
+    """
+    placed, bound = frame.copy(), dict[int, FloatArray]()
+    for part in scene.parts:
+        skin = bind_pose([(part.bones, part.bind)] if part.is_skinned else ())
+        first, *others = [node for node in nodes if node in skin] or [-1]
+        for node in others:
+            bound.setdefault(node, frame[first] @ np.linalg.solve(skin[first], skin[node]))
+    for node in nodes[1:]:
+        parent = scene.parents[node]
+        if node in bound:
+            placed[node] = bound[node]
+        elif is_regular(frame[parent]):
+            placed[node] = placed[parent] @ np.linalg.solve(frame[parent], frame[node])
+    return placed
 
 
 def _above(transforms: FloatArray, parent: int) -> FloatArray:

@@ -17,7 +17,7 @@ from lcollision_core.files import (
     write_character,
 )
 from lcollision_core.files.scene_files import read_scene
-from tests.core.gltf_builder import GltfBuilder, arm, tube
+from tests.core.gltf_builder import GltfBuilder, arm, rotation, tube
 
 SHOWN = "hidden at rest by its scale, shown as in the clip 'draw': Shield"
 HIDDEN = [0.0, 0.0, 0.0]
@@ -144,6 +144,38 @@ def test_a_skinned_joint_that_hides_its_part_is_shown_by_the_clip(tmp_path: Path
     assert character.rig is not None
     assert character.rig.joint_names[-1] == "rig:LeftHand"
     assert np.isfinite(RigBody.of(character).known_poses).all()
+
+
+@pytest.mark.parametrize("node", [0, 1])
+def test_joints_below_a_hidden_node_lie_as_bound_not_as_the_clip_bends_them(
+    tmp_path: Path, node: int
+) -> None:
+    builder = arm(split=False)
+    builder.description["nodes"][node]["scale"] = HIDDEN
+    bent = {"node": 2, "path": "rotation", "times": [0.0, 1.0], "values": [rotation(0, 1.5)] * 2}
+    shown = {"node": node, "path": "scale", "times": [0.0, 1.0], "interpolation": "STEP"}
+    builder.animation("draw", bent, shown | {"values": [HIDDEN, [1.0, 1.0, 1.0]]})
+    character = read_character(builder.write(tmp_path / "hero.glb"))
+    straight = np.array([0.5, 0.0, -1.0]) + tube()[0]
+    np.testing.assert_allclose(character.rest_vertices, straight, atol=1e-6)
+    last = character.sample("draw", None).vertices[-1]
+    assert np.abs(last - straight).max() > 1.0
+
+
+def test_a_hidden_joint_is_said_of_the_parts_that_it_moves(tmp_path: Path) -> None:
+    builder = _with_shield([1.0, 1.0, 1.0])
+    shield = builder.description["nodes"][5]
+    builder.description["nodes"][3]["children"].remove(5)
+    n = len(tube()[0])
+    attributes = builder.description["meshes"][shield["mesh"]]["primitives"][0]["attributes"]
+    attributes["JOINTS_0"] = builder.array(np.zeros((n, 4)), "u1")
+    attributes["WEIGHTS_0"] = builder.array(np.eye(4)[np.zeros(n, dtype=int)])
+    shield["skin"] = 0
+    builder.description["nodes"][3]["scale"] = HIDDEN
+    channel = {"node": 3, "path": "scale", "times": [0.0, 1.0], "interpolation": "STEP"}
+    builder.animation("draw", channel | {"values": [HIDDEN, [1.0, 1.0, 1.0]]})
+    character = read_character(builder.write(tmp_path / "hero.glb"))
+    assert "hidden at rest by its scale, shown as in the clip 'draw': Body" in character.notes
 
 
 def test_a_file_of_nothing_but_hidden_parts_says_so(tmp_path: Path) -> None:
