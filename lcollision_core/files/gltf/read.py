@@ -90,14 +90,17 @@ def require_readable(document: GltfDocument) -> None:
 
 def notes_on_extensions(document: GltfDocument) -> Iterator[str]:
     """Yield notes on unsupported extensions that affect shape or pose."""
-    nodes = document.objects("nodes")
-    constrained = [
-        _called(document, "nodes", number)
-        for number, node in enumerate(nodes)
-        if extension_of(node, _CONSTRAINT)
-    ]
-    if constrained:
-        yield left_out_note(f"constraints of nodes ({_CONSTRAINT}) are not followed", constrained)
+    for name, key, problem in (
+        (_CONSTRAINT, "", "constraints of nodes ({}) are not followed"),
+        (_INSTANCING, "skin", "instances of skinned meshes ({}) are shown once"),
+    ):
+        named = [
+            _called(document, "nodes", number)
+            for number, node in enumerate(document.objects("nodes"))
+            if extension_of(node, name) and (not key or key in node)
+        ]
+        if named:
+            yield left_out_note(problem.format(name), named)
     targets = [
         channel.get("target", {})
         for animation in document.objects("animations")
@@ -177,14 +180,15 @@ def instances(document: GltfDocument, number: int) -> FloatArray | None:
 
     Returns
     -------
-    None without EXT_mesh_gpu_instancing: the mesh is shown once, at the node
+    None without EXT_mesh_gpu_instancing, or with a skin: the mesh is shown once
 
     Raises
     ------
     MeshFileError : the transforms are damaged, or their counts differ.
     """
-    attributes = extension_of(document.objects("nodes")[number], _INSTANCING).get("attributes")
-    if not isinstance(attributes, dict) or not attributes:
+    node = document.objects("nodes")[number]
+    attributes = extension_of(node, _INSTANCING).get("attributes")
+    if not isinstance(attributes, dict) or not attributes or "skin" in node:
         return None
     where = f"the instances of node {number}"
     arrays: dict[str, FloatArray] = {}
@@ -414,7 +418,7 @@ def _part(document: GltfDocument, shown: Primitive, rest: FloatArray, looks: Glt
     morphs = _morphs(document, primitive, where, n)
     # Mirrored triangles have opposite winding.
     turned = faces[:, [0, 2, 1]]
-    placed = None if is_skinned else instances(document, shown.node)
+    placed = instances(document, shown.node)
     if placed is None:
         faces = turned if is_mirrored(rest[bones] @ bind, bone_of, weights) else faces
     else:

@@ -98,6 +98,21 @@ def test_instances_on_a_joint_are_posed_and_written_with_it(tmp_path: Path) -> N
         write_character(out, character, frames.vertices[1], CharacterForm.MORPH)
 
 
+def test_instances_of_a_skinned_mesh_are_shown_once_and_said(tmp_path: Path) -> None:
+    builder = arm(split=False)
+    (primitive,) = builder.description["meshes"][0]["primitives"]
+    normals = np.tile([0.0, 0.0, 1.0], (len(tube()[0]), 1))
+    primitive["attributes"]["NORMAL"] = builder.array(normals)
+    _instanced(builder, 4, TRANSLATION=builder.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]))
+    character = read_character(builder.write(tmp_path / "m.glb"))
+    assert len(character.rest_vertices) == len(tube()[0])
+    note = "instances of skinned meshes (EXT_mesh_gpu_instancing) are shown once: Body"
+    assert note in character.notes
+    out = tmp_path / "posed.glb"
+    write_character(out, character, character.rest_vertices, CharacterForm.MORPH)
+    assert np.allclose(read_mesh(out).vertices, character.rest_vertices, atol=1e-5)
+
+
 def test_custom_attributes_alone_say_how_many_instances_there_are(tmp_path: Path) -> None:
     builder = _tubes()
     _instanced(builder, 0, _FEATURE_ID=builder.array(np.arange(3.0)[:, None]))
