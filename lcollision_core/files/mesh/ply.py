@@ -88,6 +88,9 @@ def read(file: BinaryIO, _: object = None) -> Polygons:
         assert sizes is not None  # checked in the header
         corners = vertex_numbers(values, sizes, element_name)
         if element_name == "tristrips":
+            # Unsigned numbers store -1 as the largest one.
+            if values.dtype.kind == "u" and (last := np.iinfo(values.dtype).max) >= len(x):
+                corners[corners == last] = -1
             corners = _triangles_of_strips(corners, sizes)
             sizes = np.full(len(corners) // 3, 3)
         all_sizes.append(sizes)

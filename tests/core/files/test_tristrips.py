@@ -78,3 +78,27 @@ def test_strips_beside_faces(tmp_path: Path, order: str) -> None:
 def test_strips_of_no_triangles_are_refused(tmp_path: Path, row: list[int], message: str) -> None:
     with pytest.raises(MeshFileError, match=message):
         read_mesh(_ply(tmp_path / "a.ply", [row], "<"))
+
+
+@pytest.mark.parametrize(("kind", "code"), [("uchar", "B"), ("ushort", "H"), ("uint", "I")])
+@pytest.mark.parametrize("n_unused", [0, 240])
+def test_unsigned_strips_end_with_the_largest_number_unless_it_is_a_vertex(
+    tmp_path: Path, kind: str, code: str, n_unused: int
+) -> None:
+    row = np.array(_joined(STRIPS + SECOND), dtype=f"<{code}".lower().replace("b", "i1"))
+    header = [
+        "ply\nformat binary_little_endian 1.0",
+        f"element vertex {len(VERTICES) + n_unused}",
+        *(f"property float {axis}" for axis in "xyz"),
+        f"element tristrips 1\nproperty list int {kind} vertex_indices\nend_header\n",
+    ]
+    path = tmp_path / "boxes.ply"
+    points = np.concatenate([VERTICES, np.zeros((n_unused, 3))])
+    path.write_bytes(
+        "\n".join(header).encode()
+        + points.astype("<f4").tobytes()
+        + struct.pack("<i", len(row))
+        + row.tobytes()
+    )
+    n_faces = len(read_mesh(path).faces)
+    assert (n_faces == 24) == (kind != "uchar" or n_unused == 0)
