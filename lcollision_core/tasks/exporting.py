@@ -61,7 +61,7 @@ from lcollision_core.files.table import (
     WRITABLE_SUFFIXES,
 )
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
-from lcollision_core.motion import KeptSpan, Motion, Reason
+from lcollision_core.motion import KeptSpan, Motion, MotionReport, Reason
 from lcollision_core.motion.motion import runs
 from lcollision_core.options import MODELS_OWN, ExportAxes, ExportRequest
 from lcollision_core.posing import PoseSpace
@@ -646,9 +646,10 @@ def _count_stuck(
     row.colliding_frames = sorted({*row.colliding_frames, *np.flatnonzero(collides).tolist()})
     row.free_after = row.frames - len(row.colliding_frames)
     named = np.zeros(row.frames, dtype=np.bool_)
-    for first, last in (span["frames"] for span in row.kept_spans):
-        named[first : last + 1] = True
     of_form = [(span, True) for span in put_back]
+    ends_of_named = [span["frames"] for span in row.kept_spans]
+    for first, last in (*ends_of_named, *((span.start, span.stop - 1) for span in put_back)):
+        named[first : last + 1] = True
     of_form += [(run, False) for run in runs(collides & ~named)]
     for span, is_original in of_form:
         ends = span.start, span.stop - 1
@@ -678,8 +679,18 @@ def _write_clips(
     job.note(
         say("wrote {clips} to {path}", clips=counted(len(changes), "clip", "clips"), path=path)
     )
-    for row, of_file, put_back in zip(rows, written.free, written.put_back, strict=True):
+    for change, row, of_file, put_back in zip(
+        changes, rows, written.free, written.put_back, strict=True
+    ):
         row.output = str(path)
+        if put_back:
+            before, codes = change.before, change.after.codes.copy()
+            for span in put_back:
+                codes[span] = before.codes[span]
+            stored = replace(change.after, codes=codes)
+            report = MotionReport.of(before, stored, body.exact_check())
+            for name in ("mean_change", "largest_change", "acceleration_ratio", "largest_jump"):
+                setattr(row, name, getattr(report, name))
         # Rounding reduces the clearance slightly; without one, the check of the file decides.
         if row.clearance == 0.0:
             row.colliding_frames = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from lcollision_core.bodies.motions import (
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.contact import DEPTH_TOLERANCE
 from lcollision_core.files import Rig
+from lcollision_core.jobs import UNWATCHED
 from lcollision_core.meshes import Topology
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import (
@@ -31,7 +33,10 @@ from lcollision_core.motion import (
     screen_motion,
 )
 from lcollision_core.motion.frames import Frames
+from lcollision_core.options import MotionChoice
 from lcollision_core.resolve import ResolveOptions
+from lcollision_core.tasks.exporting import Output, write_motions
+from lcollision_core.tasks.resolving import ResolveMotionsRequest, resolve_motions
 from tests.core.brute_force import all_pairs
 from tests.core.motion.swings import CLIP, swinging, swinging_body
 from tests.rigged_shapes import (
@@ -287,6 +292,13 @@ def test_what_a_file_cannot_hold_is_put_back_in_it(tmp_path: Path) -> None:
     (back,) = read_motions(body, tmp_path / "out.glb", CLIP)
     np.testing.assert_allclose(back.codes[3:], motion.codes[3:], atol=1e-6)
     assert np.abs(back.codes[2] - codes[2]).max() < 1e-6
+    output, choice = Output(tmp_path / "again.glb", "mesh", None), MotionChoice(clip=CLIP)
+    request = ResolveMotionsRequest(body, [source], output, MotionOptions(), choice)
+    (row,) = resolve_motions(replace(request, only_check=True), UNWATCHED)
+    write_motions(output, body, source, [change], [row], UNWATCHED)
+    named = [tuple(span["frames"]) for span in row.kept_spans]
+    assert named == [(20, 27), (12, 19), (28, 35)]
+    assert 0.0 < row.largest_change < 5e-3
     far = MotionChange(motion, Motion(CLIP, motion.times, codes), [range(2, 3)], 1e-5)
     assert write_clips(tmp_path / "far.glb", body, source, [far]).put_back == [[range(2, 3)]]
 
