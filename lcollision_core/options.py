@@ -632,6 +632,7 @@ class ExportRequest:
     fps : frames per second of a motion
     mesh_format : format of the meshes in a folder; None for that of `like` or of a character, else
         obj
+    times_of : point cache whose frames' times are kept, see `point_cache`
     """
 
     axes: Annotated[
@@ -687,6 +688,7 @@ class ExportRequest:
             choices=tuple(suffix.removeprefix(".") for suffix in WRITABLE_SUFFIXES),
         ),
     ] = None
+    times_of: Path | None = None
 
 
 MODELS_OWN = ExportRequest()

@@ -709,7 +709,9 @@ def write_sequence(
         writers = [
             (
                 stack.enter_context(
-                    point_cache(target[file], len(latents), len(rows), request.fps)
+                    point_cache(
+                        target[file], len(latents), len(rows), request.fps, request.times_of
+                    )
                 ),
                 rows,
             )

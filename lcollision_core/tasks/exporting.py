@@ -238,7 +238,8 @@ def require_request(
     """
     require_one_mesh(output, len(poses))
     if output.form == "poses":
-        if request != ExportRequest(mesh_format=request.mesh_format, fps=request.fps):
+        of_meshes = replace(request, mesh_format=None, fps=MODELS_OWN.fps, times_of=None)
+        if of_meshes != MODELS_OWN:
             raise LCollisionError(
                 "would contain codes; --axes, --scale, --like, --form and --keep-clips apply only "
                 "to meshes",
@@ -599,7 +600,7 @@ def write_motions(
         NamedPose(name, motion.codes[n], motion.placement(n))
         for name, (motion, n) in zip(names, frames, strict=True)
     ]
-    request = ExportRequest(fps=motions[0].rate)
+    request = ExportRequest(fps=motions[0].rate, times_of=file)
     source = require_request(output, body, poses, request)
     # Lazily: all meshes at once may not fit in memory.
     meshes = (motion.vertices(n, check) for motion, n in frames)

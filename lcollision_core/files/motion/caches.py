@@ -83,10 +83,7 @@ def cache_rate(path: str | os.PathLike[str]) -> float | None:
     if Path(path).suffix.lower() != ".mdd":
         return None
     with _opened(path) as file:
-        times = _layout(file, ".mdd").times
-    steps = np.diff(times.astype(np.float64))
-    rate = 1.0 / float(np.median(steps)) if len(steps) and (steps > 0.0).all() else 0.0
-    return rate or None
+        return _layout(file, ".mdd").rate
 
 
 @contextmanager
@@ -107,13 +104,20 @@ class _Layout(NamedTuple):
     ----------
     n_frames, n_points : above 0
     dtype : of the coordinates
-    times : (N,) seconds of the frames; empty for PC2, which has none
+    times : (N,) seconds of the frames; for PC2 the number of its first frame, and the step
     """
 
     n_frames: int
     n_points: int
     dtype: str
     times: npt.NDArray[np.float32]
+
+    @property
+    def rate(self) -> float | None:
+        """The frames per second of an MDD file, from the median step."""
+        steps = np.diff(self.times.astype(np.float64))
+        rate = 1.0 / float(np.median(steps)) if len(steps) and (steps > 0.0).all() else 0.0
+        return rate or None
 
 
 def _layout(file: BinaryIO, suffix: str) -> _Layout:
@@ -146,6 +150,8 @@ def _layout(file: BinaryIO, suffix: str) -> _Layout:
             f"and holds {max(n_left, 0)} bytes for them"
         )
     times = np.frombuffer(file.read(n_bytes_of_times), ">f4")
+    if not is_mdd:
+        times = np.array([header["start"], header["step"]])
     return _Layout(n_frames, n_points, ">f4" if is_mdd else "<f4", times)
 
 
@@ -178,9 +184,18 @@ def write_point_cache(
 
 @contextmanager
 def point_cache(
-    path: str | os.PathLike[str], n_frames: int, n_points: int, fps: float = 30.0
+    path: str | os.PathLike[str],
+    n_frames: int,
+    n_points: int,
+    fps: float = 30.0,
+    times_of: Path | None = None,
 ) -> Iterator[Callable[[npt.NDArray[Any]], None]]:
     """Write a point cache frame by frame, atomically: see `write_point_cache`.
+
+    Parameters
+    ----------
+    times_of : a point cache; if it has the same format, and as many frames a second and in all, its
+        times are kept
 
     Yields
     ------
@@ -194,11 +209,17 @@ def point_cache(
     suffix = _suffix(path)
     if not 0.0 < fps < np.inf:
         raise ShapeError.must_be("fps", "a number above 0", fps)
-    if suffix == ".mdd":
-        times = (np.arange(n_frames) / fps).astype(">f4").tobytes()
-        head = np.array((n_frames, n_points), _MDD_HEADER).tobytes() + times
+    is_mdd = suffix == ".mdd"
+    times = np.arange(n_frames) / fps if is_mdd else np.array([0.0, 1.0])
+    if times_of is not None and times_of.suffix.lower() == suffix:
+        with _opened(times_of) as source:
+            own = _layout(source, suffix)
+        if own.n_frames == n_frames and (not is_mdd or np.isclose(own.rate or 0.0, fps)):
+            times = own.times
+    if is_mdd:
+        head = np.array((n_frames, n_points), _MDD_HEADER).tobytes() + times.astype(">f4").tobytes()
     else:
-        head = np.array((_PC2_MAGIC, 1, n_points, 0.0, 1.0, n_frames), _PC2_HEADER).tobytes()
+        head = np.array((_PC2_MAGIC, 1, n_points, *times, n_frames), _PC2_HEADER).tobytes()
     with atomic_write(path) as file:
         file.write(head)
 

@@ -125,6 +125,21 @@ def test_a_point_cache_is_screened_with_its_mesh(
     assert ": 1 of 1 frame collides, deepest frame 0 by " in alone.stdout
 
 
+@pytest.mark.parametrize("kind", ["frames", "poses"])
+def test_a_resolved_point_cache_starts_when_it_did(
+    lcollision: Lcollision, swing: Path, tmp_path: Path, kind: str
+) -> None:
+    body = open_body(swing)
+    (motion,) = read_motions(body, swing, CLIP)
+    walk, out = tmp_path / "walk.pc2", tmp_path / ("free.pc2" if kind == "frames" else "free.json")
+    write_point_cache(walk, body.decode(motion.codes[:3]))
+    data = bytearray(walk.read_bytes())
+    data[20:28] = np.array([101.0, 0.5], "<f4").tobytes()
+    walk.write_bytes(data)
+    assert lcollision("resolve", swing, walk, "--motion", "-o", out).exit_code == 0
+    assert kind == "poses" or out.read_bytes()[:32] == bytes(data[:32])
+
+
 def test_a_clip_without_a_rig_has_its_own_rate(lcollision: Lcollision, tmp_path: Path) -> None:
     body, builder = open_body("body"), GltfBuilder()
     primitive = {

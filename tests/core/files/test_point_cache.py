@@ -8,7 +8,12 @@ import pytest
 
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files.motion import caches
-from lcollision_core.files.motion.caches import cache_rate, read_point_cache, write_point_cache
+from lcollision_core.files.motion.caches import (
+    cache_rate,
+    point_cache,
+    read_point_cache,
+    write_point_cache,
+)
 from lcollision_core.files.table import POINT_CACHE_SUFFIXES
 from tests.core.background import peak_memory
 
@@ -27,6 +32,24 @@ def test_an_mdd_file_is_what_its_users_describe(tmp_path: Path) -> None:
     head = struct.pack(">2i2f", 2, 4, 0.0, 1.0 / 24.0)
     body = struct.pack(">24f", *FRAMES.ravel())
     assert (tmp_path / "m.mdd").read_bytes() == head + body
+
+
+@pytest.mark.parametrize("suffix", POINT_CACHE_SUFFIXES)
+def test_times_of_a_cache_of_as_many_frames_are_kept(tmp_path: Path, suffix: str) -> None:
+    source, out = tmp_path / f"m{suffix}", tmp_path / f"out{suffix}"
+    write_point_cache(source, FRAMES, fps=24.0)
+    data = bytearray(source.read_bytes())
+    place, form, times = (20, "<2f", (101.0, 0.5)) if suffix == ".pc2" else (8, ">2f", (4.0, 4.5))
+    data[place : place + 8] = struct.pack(form, *times)
+    source.write_bytes(data)
+    for n_frames, fps in ((2, 2.0), (1, 2.0), (2, 25.0)):
+        with point_cache(out, n_frames, 3, fps, source) as write:
+            for _ in range(n_frames):
+                write(FRAMES[0, :3])
+        is_kept = n_frames == 2 and (suffix == ".pc2" or fps == 2.0)
+        written = out.read_bytes()[place : place + 4 * n_frames]
+        assert (written == struct.pack(form, *times)) == is_kept
+        assert read_point_cache(out).shape == (n_frames, 3, 3)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
