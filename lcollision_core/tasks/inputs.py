@@ -56,8 +56,7 @@ PARTIAL = "motions.partial.json"
 def holds_motion(path: Path) -> bool:
     """Whether a file holds a motion and no mesh, or a folder only such files."""
     if path.is_dir():
-        inside = (file for file in path.rglob("*") if file.is_file())
-        return not mesh_files(path)[0] and any(map(_may_hold_motion, inside))
+        return not mesh_files(path)[0] and any(map(_may_hold_motion, _visible_files(path)))
     of_kind = path.suffix.lower() in _OF_MOTIONS
     return of_kind or is_generated(path) or is_smpl_motion(path)
 
@@ -121,7 +120,7 @@ def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None
     besides : a subfolder of results, which is skipped
     """
     is_input = _inside(folder, besides)
-    inside = (path for path in folder.rglob("*") if path.is_file() and is_input(path))
+    inside = filter(is_input, _visible_files(folder))
     files: list[Path] = []
     others: list[Path] = []
     for path in sorted(inside, key=lambda path: [natural_key(Path(part)) for part in path.parts]):
@@ -153,6 +152,14 @@ def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None
             )
         job.note(left_out)
     return files
+
+
+def _visible_files(folder: Path) -> Iterator[Path]:
+    """Yield the files in a folder and its subfolders, except hidden ones, as macOS adds to zips."""
+    for path in folder.rglob("*"):
+        is_hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if not is_hidden and path.is_file():
+            yield path
 
 
 def _inside(folder: Path, besides: Path | None) -> Callable[[Path], bool]:

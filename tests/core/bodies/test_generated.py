@@ -12,7 +12,7 @@ from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.motions import body_of_motion, read_motions
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.motion.generated import read_generated
-from lcollision_core.tasks.inputs import motion_files
+from lcollision_core.tasks.inputs import holds_motion, motion_files
 from tests.rigged_shapes import FloatArray, rigged_body
 
 PLACES = {
@@ -112,6 +112,16 @@ def test_frames_that_only_fill_an_array_are_left_out(tmp_path: Path, kind: str) 
     np.testing.assert_array_equal(filled.offsets, whole.offsets)
     assert filled.notes[:-1] == whole.notes
     assert filled.notes[-1] == "its last 3 frames hold no figure and are left out"
+
+
+def test_files_that_macos_adds_to_a_zip_are_no_motions(tmp_path: Path) -> None:
+    path, hidden = tmp_path / "a" / "walk.bvh", tmp_path / "__MACOSX" / "a" / "._walk.bvh"
+    for file in (path, hidden, tmp_path / "a" / "._walk.npz", tmp_path / ".cache" / "b.bvh"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(b"\0\5\x16\7")
+    assert motion_files(tmp_path) == [path]
+    path.unlink()
+    assert not holds_motion(tmp_path)
 
 
 def test_other_arrays_are_refused_by_what_was_expected(tmp_path: Path) -> None:
