@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import compress
@@ -219,13 +219,19 @@ def _each_by_itself(
 
     Also return (T,) whether each frame is rough: see `ResolvedMotion`. Most collisions are within
     one body, and alone it is cheaper to decode, search and solve. Bodies that a stop leaves
-    unchecked stay unchanged.
+    unchecked stay unchanged. Equal motions of one body, as in a crowd, are resolved once.
     """
     motion, options, space_at = run.motion, run.options, run.motion.space_at
     codes, is_rough = np.array(motion.codes), np.zeros(len(motion), dtype=np.bool_)
+    alike: dict[Hashable, list[int]] = {}
+    for number, body in enumerate(bodies):
+        shape = None if space_at is None else number
+        own = motion.codes[:, body.codes].tobytes(), body.own_domains(options.feet)
+        key = id(body.resolver), shape, *own, body.options(options.frame), *body.up(up)
+        alike.setdefault(key, []).append(number)
 
-    def resolve(number: int) -> None:
-        body = bodies[number]
+    def resolve(numbers: Sequence[int]) -> None:
+        body = bodies[numbers[0]]
         own, feet = body.space_in, body.own_domains(options.feet)
         of_body = replace(
             motion,
@@ -238,15 +244,14 @@ def _each_by_itself(
             feet=feet,
             keep_feet=options.keep_feet and (not options.feet or bool(feet)),
         )
-        job, axis = run.job.part(reports.of(number)), np.asarray(up) @ body.place.rotation
         try:
             resolved = resolve_motion(
                 body.resolver,
                 of_body,
-                axis,
+                body.up(up),
                 of_options,
                 workers,
-                job,
+                run.job.part(reports.of(numbers[0])),
                 within=run.within,
                 stop=run.stop,
             )
@@ -254,11 +259,12 @@ def _each_by_itself(
             if run.job.cancelled:
                 raise
             return
-        codes[:, body.codes] = resolved.motion.codes
+        for number in numbers:
+            codes[:, bodies[number].codes] = resolved.motion.codes
         is_rough[[frame for span in resolved.rough for frame in span]] = True
 
     with ThreadPoolExecutor(workers or available_cores(), "bodies of a motion") as pool:
-        for _ in pool.map(resolve, range(len(bodies))):
+        for _ in pool.map(resolve, alike.values()):
             pass
     return replace(motion, codes=codes), is_rough
 

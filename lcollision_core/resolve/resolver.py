@@ -477,6 +477,11 @@ class BodyAlone:
         """Return its own indices of those scene domains that are its own."""
         return frozenset(part - self.domains.start for part in domains if part in self.domains)
 
+    def up(self, up: npt.ArrayLike) -> tuple[float, float, float]:
+        """Convert a (3,) direction of the scene to its own axes."""
+        x, y, z = (np.asarray(up) @ self.place.rotation).tolist()
+        return x, y, z
+
     def options(self, options: ResolveOptions) -> ResolveOptions:
         """Convert the scene's options to its own lengths, indices and axes."""
         scale, weights, up = self.place.scale, options.group_weights, options.standing
@@ -490,7 +495,7 @@ class BodyAlone:
             still_domains=self.own_domains(options.still_domains),
             locked_codes=frozenset(np.flatnonzero(np.isin(self.codes, list(locked))).tolist()),
             group_weights=None if weights is None else (weights[0], *weights[slice(*own)]),
-            standing=None if up is None else tuple((up @ self.place.rotation).tolist()),
+            standing=None if up is None else self.up(up),
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,11 +34,12 @@ def test_bodies_that_do_not_meet_come_out_as_each_does_alone() -> None:
     motion = motion.part(range(4, 20))
     alone = open_body(SWING)
     own = read_motions(alone, Path(SWING), motion.name, None)[0].part(range(4, 20))
-    expected = resolve_motion(alone.resolver, own, alone.up)
     reports: list[tuple[int, int]] = []
-    result = resolve_motion(
-        body.resolver, motion, body.up, job=Job(lambda *done: reports.append(done))
-    )
+    job = Job(lambda *done: reports.append(done))
+    expected = resolve_motion(alone.resolver, own, alone.up, job=job)
+    of_one = reports[-1]
+    reports.clear()
+    result = resolve_motion(body.resolver, motion, body.up, job=job)
     assert not result.before.all()
     assert result.after.all()
     for name in ("first", "second"):
@@ -46,7 +48,9 @@ def test_bodies_that_do_not_meet_come_out_as_each_does_alone() -> None:
     assert [span.start for span in result.spans] == [span.start for span in expected.spans]
     done = [n_done for n_done, _ in reports]
     assert done == sorted(done)
-    assert reports[-1][0] == reports[-1][1]
+    # Both move alike, and are resolved once.
+    assert reports[-1] == of_one
+    assert of_one[0] == of_one[1]
 
 
 def test_no_frame_has_more_pairs_where_bodies_meet() -> None:
@@ -68,6 +72,10 @@ def test_no_frame_has_more_pairs_where_bodies_meet() -> None:
 def test_a_stop_keeps_what_was_freed_in_each_body() -> None:
     body, motion = _scene(1.0)
     motion = motion.part(range(3, 14))
+    # Bodies that move differently are not resolved as one.
+    first, second = (body.codes_of_member(name, motion.codes) for name in ("first", "second"))
+    each = zip(first, 1.001 * second, strict=True)
+    motion = replace(motion, codes=np.stack([body.joined_codes(codes) for codes in each]))
     stop, totals = Job(), list[int]()
 
     def report(_: int, n_frames: int) -> None:
