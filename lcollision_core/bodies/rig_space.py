@@ -978,7 +978,18 @@ def _inverses(matrices: FloatArray) -> FloatArray:
 
 
 def _nearest_rotations(matrices: FloatArray) -> FloatArray:
-    """Return the rotations nearest to (N, 3, 3) matrices."""
+    """Return the rotations nearest to (N, 3, 3) matrices of successive frames.
+
+    Mirrored ones are all mirrored back along the same direction, as the nearest one may jump.
+    """
+    mirrored = np.flatnonzero(np.linalg.det(matrices) < 0.0)
+    if len(mirrored):
+        first = matrices[mirrored[0]]
+        _, scales, right = np.linalg.svd(first)
+        is_flat = scales[2] < 0.5 * scales[1]
+        way = right[2] if is_flat else np.linalg.eigh(first + first.T).eigenvectors[:, 0]
+        matrices = matrices.copy()
+        matrices[mirrored] -= 2.0 * (matrices[mirrored] @ way)[:, :, None] * way
     left, _, right = np.linalg.svd(matrices)
     left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
     rotations: FloatArray = left @ right

@@ -189,6 +189,23 @@ def test_turns_of_any_origin_are_expressed_and_scales_left_out() -> None:
     assert np.abs(space.decode(codes[None])[0] - space.skinned(scaled)).max() > 0.01
 
 
+@pytest.mark.parametrize(
+    "scale", [(-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, -1), (-1.1, 0.9, 1), (0.2, -0.2, 0.2)]
+)
+def test_turns_of_a_mirrored_joint_do_not_jump(scale: tuple[float, float, float]) -> None:
+    character = rigged_body()
+    rig, space = rig_of(character), RigPoseSpace(character)
+    joint = rig.joint_names.index("RightForeArm")
+    turns = np.tile(np.eye(3), (41, len(rig.parents), 1, 1))
+    angles = np.outer(np.linspace(0.0, 0.8, 41), [0.3, 0.2, 1.0])
+    turns[:, joint] = Rotation.from_rotvec(angles).as_matrix() @ np.diag(scale)
+    # As rounded to single precision in a file.
+    codes = space.unwound(space.codes_of_transforms(turned(rig, turns).astype(np.float32)))
+    assert np.abs(np.diff(codes, axis=0)).max() < 0.1
+    if max(scale) > 0.0:
+        assert np.abs(codes[0]).max() < 1e-3
+
+
 def test_roots_that_share_nothing_move_as_one_body() -> None:
     tube = CHARACTERS["tube"]
     rig = replace(rig_of(tube), parents=np.array([-1, 0, -1]))
