@@ -58,7 +58,7 @@ def test_scape_from_meshes_to_an_exported_pose(
     assert crossing_pairs(*read_obj(scan))
     steps = {
         "train embedding": (folder, "-o", model),
-        "label": (model, "-n", 6000, "-o", store),
+        "label": (model, "-n", 3000, "-o", store),
         "train predictor": (model, store, "-o", model),
         "resolve": (model, scan, "-o", fixed),
     }
