@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import ipctk
@@ -53,6 +54,33 @@ def faces_with(parts: npt.NDArray[Any], faces: npt.NDArray[Any]) -> npt.NDArray[
     return np.array([row + [-1] * (longest - len(row)) for row in rows])
 
 
+Balls = tuple[FloatArray, FloatArray, FloatArray]
+
+
+def moving_balls(cells: npt.NDArray[Any], before: FloatArray, after: FloatArray) -> Balls:
+    """Return the middles of (n, k) cells before and after, and the radius around them all the way.
+
+    The farthest corner's distance from the middle is convex on a linear path.
+    """
+    middles = [pose[cells].mean(axis=1) for pose in (before, after)]
+    away = [
+        np.linalg.norm(pose[cells] - middle[:, None], axis=2).max(axis=1)
+        for pose, middle in zip((before, after), middles, strict=True)
+    ]
+    return middles[0], middles[1], np.maximum(*away)
+
+
+def meet(one: Sequence[FloatArray], other: Sequence[FloatArray]) -> npt.NDArray[np.bool_]:
+    """Return whether n pairs of moving balls touch at some time."""
+    begin, end = one[0] - other[0], one[1] - other[1]
+    way = end - begin
+    length = np.maximum((way * way).sum(axis=1), np.finfo(np.float64).tiny)
+    share = np.clip(-(begin * way).sum(axis=1) / length, 0.0, 1.0)
+    nearest = np.linalg.norm(begin + share[:, None] * way, axis=1)
+    touch: npt.NDArray[np.bool_] = nearest <= (1.0 + 1e-9) * (one[2] + other[2])
+    return touch
+
+
 def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int], list[int]]:
     """Return the frames that intersect, and those with a hit before the next, found by ipctk.
 
@@ -70,11 +98,19 @@ def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int],
         "face": np.arange(len(faces))[:, None],
     }
 
-    def counted(candidates: list[Any], one: str, other: str) -> list[Any]:
-        left, right = (
-            of[side.rstrip("01")][[getattr(c, f"{side}_id") for c in candidates]]
-            for side in (one, other)
-        )
+    cells = {"vertex": np.arange(body.n_vertices)[:, None], "edge": edges, "face": faces}
+
+    def counted(candidates: list[Any], one: str, other: str, *path: FloatArray) -> list[Any]:
+        """Return the candidates that lie on a pair of faces that counts, and may meet on a path."""
+        kinds = [side.rstrip("01") for side in (one, other)]
+        ids = [np.array([getattr(c, f"{s}_id") for c in candidates], int) for s in (one, other)]
+        may_meet = np.arange(len(candidates))
+        if path:
+            balls = [moving_balls(cells[kind], *path) for kind in kinds]
+            may_meet = np.flatnonzero(
+                meet(*([each[own] for each in ball] for ball, own in zip(balls, ids, strict=True)))
+            )
+        left, right = (of[kind][own[may_meet]] for kind, own in zip(kinds, ids, strict=True))
         both = np.stack(np.broadcast_arrays(left[:, :, None], right[:, None, :]), axis=-1)
         are_faces = (both >= 0).all(axis=-1)
         row, pairs = np.nonzero(are_faces)[0], both[are_faces].astype(np.int32)
@@ -85,7 +121,7 @@ def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int],
         keys, key_of = np.unique(keys, return_inverse=True)
         once = np.stack(np.divmod(keys, len(faces)), axis=1).astype(np.int32)
         counts = (detector.rules_of(once, np.ones(len(once))) == 0)[key_of]
-        return [candidates[at] for at in np.unique(row[apart][counts])]
+        return [candidates[may_meet[at]] for at in np.unique(row[apart][counts])]
 
     # Skip most pairs near at rest, by single vertices; the rules decide on the rest.
     start, near = detector._exclusions.near
@@ -115,9 +151,10 @@ def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int],
             break
         candidates = ipctk.Candidates()
         candidates.build(mesh, pose, poses[at + 1])
-        candidates.ee_candidates = counted(candidates.ee_candidates, "edge0", "edge1")
-        candidates.fv_candidates = counted(candidates.fv_candidates, "face", "vertex")
-        if not candidates.is_step_collision_free(mesh, pose, poses[at + 1], narrow_phase_ccd=ccd):
+        path = pose, poses[at + 1]
+        candidates.ee_candidates = counted(candidates.ee_candidates, "edge0", "edge1", *path)
+        candidates.fv_candidates = counted(candidates.fv_candidates, "face", "vertex", *path)
+        if not candidates.is_step_collision_free(mesh, *path, narrow_phase_ccd=ccd):
             hit.append(at)
     return crossing, hit
 
