@@ -611,7 +611,6 @@ class FaceHighlight:
 
     Attributes
     ----------
-    hidden : (F,) bool array, the faces that are not drawn; None for none
     visible_actor, occluded_actor : actors to be added to a renderer; the second shows occluded
         faces, on the far side or inside a limb, translucently through the body
     """
@@ -620,7 +619,8 @@ class FaceHighlight:
         self, surface: Surface, faces: npt.NDArray[np.int32], colour: str, layer: int
     ) -> None:
         self._faces = faces
-        self.hidden: npt.NDArray[np.bool_] | None = None
+        self._hidden: npt.NDArray[np.bool_] | None = None
+        self._shown: npt.NDArray[np.integer] | None = None
         self._polydata = pv.PolyData()
         self._polydata.SetPoints(surface.polydata.GetPoints())
         self.visible_actor = make_actor(self._polydata, color=colour, ambient=0.55, diffuse=0.5)
@@ -638,12 +638,18 @@ class FaceHighlight:
 
     def show(self, faces: npt.NDArray[np.integer] | None) -> None:
         """Draw the faces whose indices are in an array of any shape; None for none."""
+        self._shown = faces
         face_numbers = np.unique(faces) if faces is not None else np.empty(0, dtype=np.int64)
-        if self.hidden is not None:
-            face_numbers = face_numbers[~self.hidden[face_numbers]]
+        if self._hidden is not None:
+            face_numbers = face_numbers[~self._hidden[face_numbers]]
         if len(face_numbers):
             self._polydata.SetPolys(pv.CellArray.from_regular_cells(self._faces[face_numbers]))
         self._set_visible(len(face_numbers) > 0)
+
+    def hide(self, hidden: npt.NDArray[np.bool_] | None) -> None:
+        """Hide faces, a (F,) bool array, even if they are highlighted; None for none."""
+        self._hidden = hidden
+        self.show(self._shown)
 
     def copy_from(self, other: FaceHighlight) -> None:
         """Show the faces of another highlight of the same mesh."""

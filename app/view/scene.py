@@ -190,7 +190,7 @@ class Scene:
         for surface in (self.surface, self._ghost):
             surface.draw(visible_faces)
         for highlight in self._highlights:
-            highlight.hidden = hidden
+            highlight.hide(hidden)
         if self._textured is not None:
             textured = self.is_textured
             self.show_textured(False)

@@ -22,7 +22,7 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import TIGHT
 from app.window.layout import Docking
-from app.window.widgets import described, hbox, held, labelled, push_button
+from app.window.widgets import described, hbox, held, labelled, plain_tip, push_button
 from lcollision_core.tasks.words import say
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 _NAME, _SEEN, _LOCKED, _COUNTED = range(4)
 _HEADER = ("Body", "Show", "Lock", "Check")
 _TIPS = (
-    "",
     "Draw this body",
     "Keep this body where it is: drags, Resolve and random poses move the others",
     "Count the collisions of this body",
@@ -228,6 +227,7 @@ def _row_of(name: str) -> QTreeWidgetItem:
     row = QTreeWidgetItem([name])
     flags = Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsSelectable
     row.setFlags(flags | Qt.ItemFlag.ItemIsUserCheckable)
-    for column, tip in enumerate(_TIPS):
+    # A long name is elided.
+    for column, tip in enumerate((plain_tip(name), *_TIPS)):
         row.setToolTip(column, tip)
     return row

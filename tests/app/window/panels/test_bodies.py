@@ -95,6 +95,17 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
     assert [row.text(0) for row in rows if row is not None] == ["hero", "hero 2"]
     second = tree.topLevelItem(1)
     assert second is not None
+    # A long name is elided.
+    assert second.toolTip(0) == "hero 2"
+    # What is tinted of a body is hidden and shown with it.
+    assert window.viewport.scene is not None
+    selection, faces = window.viewport.scene.selection, np.arange(len(scene.faces))
+    window.viewport.tint_faces(faces)
+    second.setCheckState(1, Qt.CheckState.Unchecked)
+    assert selection.n_faces == len(faces) // 2
+    second.setCheckState(1, Qt.CheckState.Checked)
+    assert selection.n_faces == len(faces)
+    window.viewport.tint_faces(None)
     second.setCheckState(2, Qt.CheckState.Checked)
     # The row must outlive the click: it is used when the locks change.
     assert second.checkState(2) is Qt.CheckState.Checked
