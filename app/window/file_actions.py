@@ -147,7 +147,7 @@ class FileActions(QObject):
         document.tasks.wrong_scale.connect(self._offer_scale, Qt.ConnectionType.QueuedConnection)
         self._dropped: tuple[Path, int] | None = None
         self._last_message = ""
-        self._pose_to_restore: NamedPose | None = None
+        self._pose_to_restore: tuple[NamedPose, Body] | None = None
 
     def ask_and_open(self, title: str, *kinds: str) -> None:
         """Ask for a file of some kinds and open it; see `_kinds`."""
@@ -309,13 +309,15 @@ class FileActions(QObject):
             self._dropped = (path, len(paths))
 
     def add_to_scene(self, path: Path) -> None:
-        """Open the current body and one more beside it as a scene."""
+        """Open the current body, in its pose, and one more beside it as a scene."""
         from lcollision_core.tasks.scenes import kept_scene, with_body
 
         history = self._document.history
-        if self.confirm_losing_changes():
+        if self._confirm_losing_motions() and self._may_lose_library():
             file = str(history.model.own_file or history.model_file)
             scene = with_body(history.model, file, path)
+            if history.state.moment is None and history.latent.any():
+                self._pose_to_restore = history.pose, history.model
             self._document.tasks.open_model(kept_scene(scene))
 
     def play_clip(self, name: str, clip: str, start: float) -> None:
@@ -339,7 +341,7 @@ class FileActions(QObject):
         history = self._document.history
         if self._confirm_losing_motions() and self._may_lose_library():
             file = str(history.model.own_file or history.model_file)
-            self._pose_to_restore = history.pose
+            self._pose_to_restore = history.pose, history.model
             self._document.tasks.open_model(with_ground(history.model, file))
 
     def save_scene(self) -> None:
@@ -353,6 +355,7 @@ class FileActions(QObject):
         path = self.ask_save("Save scene", scene.name, {"Scene": POSES_SUFFIX}, None)
         if path is not None:
             write_scene_file(path, scene.file)
+            self._remember(path)
             self._document.message.emit(f"Saved the scene to {path.name}")
 
     def new_pose(self) -> None:
@@ -690,11 +693,14 @@ class FileActions(QObject):
     @Slot(object)
     def _on_arrived(self, path: Path) -> None:
         """Remember a file that has been opened, and report those dropped with it."""
+        from lcollision_core.tasks.scenes import carried_pose
+
         if path.suffix.lower() in (*READABLE_SUFFIXES, *CHARACTER_SUFFIXES):
             self._remember(path)
-        carried, self._pose_to_restore = self._pose_to_restore, None
-        if carried is not None and len(carried.latent) == self._document.model.latent_size:
-            self._document.history.load(f"Load {carried.name}", carried, Source.TRAINING)
+        before, self._pose_to_restore = self._pose_to_restore, None
+        pose = before and carried_pose(*before, self._document.model)
+        if pose is not None:
+            self._document.history.load(f"Load {pose.name}", pose, Source.TRAINING)
         dropped, self._dropped = self._dropped, None
         if dropped is not None and dropped[0].absolute() == path.absolute():
             others = counted(dropped[1] - 1, "other file was", "other files were")

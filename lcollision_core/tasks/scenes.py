@@ -160,6 +160,26 @@ def with_body(body: Body, body_file: str, path: Path) -> SceneFile:
     return beside(_scene_around(body, body_file), path.absolute())
 
 
+def carried_pose(pose: NamedPose, before: Body, after: Body) -> NamedPose | None:
+    """Return a pose of a body or a scene in one with a further body, at rest, or another ground.
+
+    None if `after` does not begin with the bodies of `before`.
+    """
+    old, new = as_scene(before), as_scene(after)
+    if len(pose.latent) == after.latent_size:
+        return pose
+    posed = [before] if old is None else [one.body for one in old.standing]
+    held = () if new is None else new.standing[: len(posed)]
+    if new is None or [one.fingerprint for one in posed] != [one.body.fingerprint for one in held]:
+        return None
+    codes = [pose.latent]
+    if old is not None:
+        codes = [old.codes_of_member(one.name, pose.latent) for one in old.standing]
+    own = {one.name: codes_of_one for one, codes_of_one in zip(held, codes, strict=True)}
+    latent = new.joined_codes([own.get(one.name) for one in new.members])
+    return NamedPose(pose.name, latent, pins=pose.pins)
+
+
 def with_ground(body: Body, body_file: str) -> str:
     """Toggle the ground of a body or a scene, and return the file of the result.
 

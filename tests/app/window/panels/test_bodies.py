@@ -149,6 +149,8 @@ def test_another_body_that_is_dropped_joins_where_that_is_wanted(
         words = "Add to the scene"
         next(one for one in dialog.buttons() if one.text().replace("&", "") == words).click()
 
+    posed = lowered(document.model)
+    document.motion.set_code(int(np.flatnonzero(posed)[0]), float(posed[posed != 0.0][0]))
     for path in (villain, chair):
         timer = answer(join)
         with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
@@ -159,6 +161,17 @@ def test_another_body_that_is_dropped_joins_where_that_is_wanted(
     scene = as_scene(document.model)
     assert scene is not None
     assert [member.name for member in scene.members] == ["hero", "villain", "chair"]
+    # The bodies keep their poses, which one undo puts back to rest; nothing is asked about them.
+    latent = document.history.latent
+    np.testing.assert_array_equal(scene.codes_of_member("hero", latent), posed)
+    assert np.count_nonzero(latent) == 1
+    document.history.undo()
+    assert not document.history.latent.any()
+    # A saved scene is found among the recent files.
+    saved = tmp_path / "trio.json"
+    monkeypatch.setattr(window.files, "ask_save", lambda *_: saved)
+    window.bodies.save.click()
+    assert window.settings["recent_files"][0] == str(saved.resolve())
 
 
 @pytest.mark.slow
