@@ -715,6 +715,7 @@ class Reason(StrEnum):
     TOO_FAR = marked("resolving them would exceed the largest change")
     NOT_FOUND = marked("no collision-free pose was found")
     BETWEEN = marked("resolving them makes in-between poses collide")
+    JERKS = marked("resolving them makes the motion jerk")
     AS_WRITTEN = marked("the file format can't store the correction")
     STOPPED = marked("resolving was stopped before they were free")
 

@@ -43,6 +43,10 @@ _SOFT_ROUNDS = 6
 """Most rounds of smoothing corrections that remove overlap, each without the frames that became
 worse."""
 
+_JERK, _JERKIER = 0.03, 3.0
+"""Second difference of successive frames at 30 a second, as root mean square over the vertices in
+normalised length, from which a correction jerks, unless the original bends a third as much."""
+
 _EXTRA_CLEARANCES, _MOST_BETWEEN = (0.0, 0.0, 0.002, 0.004, 0.008), 7
 """Normalised distance added between parts in poses between frames, for each round of solving spans
 that touch there, and the most such poses per frame."""
@@ -107,11 +111,12 @@ def resolve_motion(
     seam. With `continuous` in the options, spans in which something touches on the linear path of
     the vertices between two frames are solved again with more poses there, until nothing does.
 
-    No frame gets more pairs or deeper ones than it had, no free frame collides, and no vertex moves
-    farther than the largest change. Poses between two frames, neither of which is freed, get no
-    more pairs or deeper ones than there were from one to the next. Frames that cannot be resolved
-    within these limits are left out, and the frames around them are resolved without them. They
-    then get the least overlap found within the limits, or stay unchanged to the bit.
+    No frame gets more pairs or deeper ones than it had, no free frame collides, no vertex moves
+    farther than the largest change, and no correction jerks. Poses between two frames, neither of
+    which is freed, get no more pairs or deeper ones than there were from one to the next. Frames
+    that cannot be resolved within these limits are left out, and the frames around them are
+    resolved without them. They then get the least overlap found within the limits, or stay
+    unchanged to the bit.
 
     In a scene, each body is resolved separately first, and then the spans that still collide, as
     where bodies meet. If that makes a frame worse, all bodies are resolved together from the start.
@@ -697,6 +702,7 @@ class _Resolution:
             if not self.is_changed[own].any():
                 continue
             faults = self.guard.faults(span, self.codes, self.after, self._fractions)
+            faults = faults or self._jerk(span)
             if not faults:
                 continue
             self._put_back(span)
@@ -717,6 +723,26 @@ class _Resolution:
                 nearest = min(inside, key=lambda run: max(run.start - place, place - run.stop + 1))
                 self._bar(own[nearest.start : nearest.stop], reason)
         return [span for span in self._spans() if is_open[self._own(span)].any()]
+
+    def _jerk(self, span: range) -> dict[int, Reason]:
+        """Return the colliding frame nearest to the worst jerk that correcting a span adds."""
+        at = np.arange(span.start - 2, span.stop + 2)
+        at = at % self.n if self.is_cycle else at[(at >= 0) & (at < self.n)]
+        # At the ends of the frames that may change, the motion may have to jump.
+        at = at[np.isin(at, np.asarray(self.within) % self.n)]
+        before, after = (
+            np.sqrt(np.einsum("td,de,te->t", bends, self.frames.metric, bends))
+            for bends in (
+                np.diff(codes[at], 2, axis=0) for codes in (self.motion.codes, self.codes)
+            )
+        )
+        colliding = np.flatnonzero(self.colliding[at])
+        most = max(_JERK * (NOMINAL_RATE / self.motion.rate) ** 2, _JERKIER * before.max(initial=0))
+        # Without easing, the motion jumps at both ends of each span.
+        if not self._easing or not len(colliding) or after.max(initial=0.0) <= most:
+            return {}
+        nearest = colliding[np.abs(colliding - 1 - after.argmax()).argmin()]
+        return {int(at[nearest]): Reason.JERKS}
 
     def _drop_contacts(self, span: range, faults: Sequence[int]) -> bool:
         """Drop the kept contacts near faults of a span; return whether there were any.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,7 @@ from lcollision_core.motion import (
     resolve_motion,
     screen_motion,
 )
-from lcollision_core.motion.frames import Frames
+from lcollision_core.motion.frames import Frames, Reason
 from lcollision_core.options import MotionChoice
 from lcollision_core.resolve import ResolveOptions
 from lcollision_core.tasks.exporting import Output, write_motions
@@ -60,6 +61,14 @@ def overlaps(body: RigBody, vertices: np.ndarray) -> tuple[int, float]:
     return len(depth), float(depth.max(initial=0.0))
 
 
+def largest_bend(body: RigBody, motion: Motion) -> float:
+    """Return the largest second difference of a frame, as root mean square, normalised."""
+    check = body.exact_check()
+    vertices = np.stack([motion.vertices(frame, check) for frame in range(len(motion))])
+    bends = np.linalg.norm(np.diff(vertices, 2, axis=0), axis=2) / body.body_size
+    return float(np.sqrt((bends**2).mean(axis=1)).max())
+
+
 def require_no_worse(
     body: RigBody, before: Motion, found: ResolvedMotion, largest_change: float
 ) -> None:
@@ -76,6 +85,9 @@ def require_no_worse(
         may_change[span.start : span.stop] = True
     assert after.codes[~may_change].tobytes() == before.codes[~may_change].tobytes()
     is_freed = found.after & ~found.before
+    # A correction jerks by its displacements to first order.
+    was_bent, is_bent = (largest_bend(body, motion) for motion in (before, after))
+    assert is_bent <= 1.5 * max(0.03, 3.0 * was_bent)
     original = [overlaps(body, before.vertices(frame, check)) for frame in range(len(before))]
     for frame, (n_before, depth_before) in enumerate(original):
         old, new = (motion.vertices(frame, check) for motion in (before, after))
@@ -177,6 +189,20 @@ def test_no_rig_morph_or_clip_comes_out_worse(
     )
     found = resolve_motion(body.resolver, motion, UP, options)
     require_no_worse(body, motion, found, largest_change)
+
+
+def test_a_correction_that_jerks_is_left_out_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    body, motion = swinging()
+    motion = motion.part(range(6, 18))
+    assert resolve_motion(body.resolver, motion, body.up).after.all()
+    # As if the swing itself were a jerk.
+    limits = sys.modules["lcollision_core.motion.resolve_motion"]
+    monkeypatch.setattr(limits, "_JERK", 0.0)
+    monkeypatch.setattr(limits, "_JERKIER", 0.5)
+    found = resolve_motion(body.resolver, motion, body.up)
+    assert {kept.reason for kept in found.kept} == {Reason.JERKS}
+    assert found.before.sum() <= found.after.sum() < len(motion)
+    require_no_worse(body, motion, found, ResolveOptions().largest_change or np.inf)
 
 
 def in_the_trunk(frames: range) -> tuple[RigBody, Motion]:
