@@ -163,12 +163,16 @@ class _Start:
 
 
 def _tell_failure(work: WorkFolder, sentence: str) -> None:
-    """Store why the run failed, unless another process holds it or the disk is full."""
+    """Store why the run failed, unless another process holds it or the disk is full.
+
+    What the run itself has stored is not written again: a window may have discarded it since.
+    """
     from lcollision_core.errors import MeshFileError
 
-    if not work.is_locked:
+    status = work.status
+    if not work.is_locked and (status.state, status.sentence) != (RunState.FAILED, sentence):
         with suppress(MeshFileError):
-            failed = replace(work.status, state=RunState.FAILED, sentence=sentence)
+            failed = replace(status, state=RunState.FAILED, sentence=sentence)
             work.write_status(replace(failed, seconds_left=None))
 
 

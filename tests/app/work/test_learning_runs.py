@@ -225,6 +225,22 @@ def test_what_the_disk_refuses_is_advised_on(
     assert advice in work.status.sentence
 
 
+def test_a_failure_is_stored_once_as_the_run_may_be_discarded_meanwhile(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stay_as_it_is(monkeypatch)
+    work, file_numbers = folder_of("hero", RunState.RUNNING), list[int]()
+
+    def fail(work: WorkFolder, _: object) -> None:
+        work.write_status(LearningStatus(RunState.FAILED, sentence="nothing to learn from"))
+        file_numbers.append((work.path / "status.json").stat().st_ino)
+        raise LCollisionError("nothing to learn from")
+
+    monkeypatch.setattr(learning, "learn_model", fail)
+    assert learner.main([str(work.path)]) == 2
+    assert [(work.path / "status.json").stat().st_ino] == file_numbers
+
+
 def test_a_state_that_is_not_known_is_one_of_a_run_that_is_stopped(runs: LearningRuns) -> None:
     work = folder_of("hero", RunState.RUNNING)
     status = work.path / "status.json"
