@@ -147,7 +147,7 @@ class FileActions(QObject):
         document.tasks.wrong_scale.connect(self._offer_scale, Qt.ConnectionType.QueuedConnection)
         self._dropped: tuple[Path, int] | None = None
         self._last_message = ""
-        self._pose_to_restore: tuple[NamedPose, Body] | None = None
+        self._pose_to_restore: tuple[NamedPose, Body, str] | None = None
 
     def ask_and_open(self, title: str, *kinds: str) -> None:
         """Ask for a file of some kinds and open it; see `_kinds`."""
@@ -312,13 +312,25 @@ class FileActions(QObject):
         """Open the current body, in its pose, and one more beside it as a scene."""
         from lcollision_core.tasks.scenes import kept_scene, with_body
 
+        self._open_in_pose(lambda body, file: kept_scene(with_body(body, file, path)))
+
+    def remove_from_scene(self, name: str) -> None:
+        """Open the scene without one of its bodies; the others keep their pose."""
+        from lcollision_core.bodies import as_scene
+        from lcollision_core.tasks.scenes import without_body
+
+        scene = as_scene(self._document.model)
+        assert scene is not None
+        self._open_in_pose(lambda *_: without_body(scene, name), removed=name)
+
+    def _open_in_pose(self, changed: Callable[[Body, str], str | Path], removed: str = "") -> None:
+        """Open the file made from the current body and its file, with bodies as they are posed."""
         history = self._document.history
         if self._confirm_losing_motions() and self._may_lose_library():
-            file = str(history.model.own_file or history.model_file)
-            scene = with_body(history.model, file, path)
+            file = changed(history.model, str(history.model.own_file or history.model_file))
             if history.state.moment is None and history.latent.any():
-                self._pose_to_restore = history.pose, history.model
-            self._document.tasks.open_model(kept_scene(scene))
+                self._pose_to_restore = history.pose, history.model, removed
+            self._document.tasks.open_model(file)
 
     def play_clip(self, name: str, clip: str, start: float) -> None:
         """Let a body of the scene play a clip that starts after `start` seconds."""
@@ -341,7 +353,7 @@ class FileActions(QObject):
         history = self._document.history
         if self._confirm_losing_motions() and self._may_lose_library():
             file = str(history.model.own_file or history.model_file)
-            self._pose_to_restore = history.pose, history.model
+            self._pose_to_restore = history.pose, history.model, ""
             self._document.tasks.open_model(with_ground(history.model, file))
 
     def save_scene(self) -> None:
@@ -698,7 +710,10 @@ class FileActions(QObject):
         if path.suffix.lower() in (*READABLE_SUFFIXES, *CHARACTER_SUFFIXES):
             self._remember(path)
         before, self._pose_to_restore = self._pose_to_restore, None
-        pose = before and carried_pose(*before, self._document.model)
+        pose = None
+        if before is not None:
+            posed, body, removed = before
+            pose = carried_pose(posed, body, self._document.model, removed)
         if pose is not None:
             self._document.history.load(f"Load {pose.name}", pose, Source.TRAINING)
         dropped, self._dropped = self._dropped, None

@@ -185,6 +185,9 @@ class MainWindow(EditorWindow):
         self.bodies.clip_wanted.connect(
             lambda *wanted: self.attempt(partial(self.files.play_clip, *wanted))
         )
+        self.bodies.removal_wanted.connect(
+            lambda name: self.attempt(partial(self.files.remove_from_scene, name))
+        )
         for rows in (self.sliders, self.collision.prediction):
             rows.domain_hovered.connect(self.viewport.highlight_domain)
             rows.menu_wanted.connect(self._body_menus.open_on_part)

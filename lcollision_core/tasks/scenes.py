@@ -160,23 +160,57 @@ def with_body(body: Body, body_file: str, path: Path) -> SceneFile:
     return beside(_scene_around(body, body_file), path.absolute())
 
 
-def carried_pose(pose: NamedPose, before: Body, after: Body) -> NamedPose | None:
-    """Return a pose of a body or a scene in one with a further body, at rest, or another ground.
+def without_body(scene: SceneBody, name: str) -> str:
+    """Return the file of a scene without one of its bodies, or of the only one that is left.
 
-    None if `after` does not begin with the bodies of `before`.
+    What the body holds stays where it is.
+
+    Raises
+    ------
+    LCollisionError : the scene file cannot be written.
     """
-    old, new = as_scene(before), as_scene(after)
+    assert scene.file is not None
+    parts = [
+        replace(part, name=member.name)
+        if part.held_by != name
+        else replace(part, name=member.name, held_by="", joint="")
+        for part, member in zip(scene.file.bodies, scene.members, strict=False)
+        if member.name != name
+    ]
+    if len(parts) == 1 and scene.file.ground is None:
+        return parts[0].file
+    return str(kept_scene(replace(scene.file, bodies=tuple(parts), path="")))
+
+
+def carried_pose(pose: NamedPose, before: Body, after: Body, removed: str = "") -> NamedPose | None:
+    """Return a pose of a body or a scene in one with other bodies besides, at rest, or fewer.
+
+    Bodies are those of the same name; a body alone has none. None if no body is in both.
+
+    Parameters
+    ----------
+    removed : the name of the body that is no longer in the scene
+    """
     if len(pose.latent) == after.latent_size:
         return pose
-    posed = [before] if old is None else [one.body for one in old.standing]
-    held = () if new is None else new.standing[: len(posed)]
-    if new is None or [one.fingerprint for one in posed] != [one.body.fingerprint for one in held]:
+    old, new = as_scene(before), as_scene(after)
+    posed, shown = (
+        [("", body)] if scene is None else [(one.name, one.body) for one in scene.standing]
+        for scene, body in ((old, before), (new, after))
+    )
+    own: dict[str, npt.NDArray[np.float64]] = {}
+    for old_name, old_body in posed:
+        if removed and old_name == removed:
+            continue
+        for name, body in shown:
+            is_same = body.fingerprint == old_body.fingerprint
+            if name not in own and is_same and (name == old_name or "" in (name, old_name)):
+                codes = pose.latent
+                own[name] = codes if old is None else old.codes_of_member(old_name, codes)
+                break
+    if not own:
         return None
-    codes = [pose.latent]
-    if old is not None:
-        codes = [old.codes_of_member(one.name, pose.latent) for one in old.standing]
-    own = {one.name: codes_of_one for one, codes_of_one in zip(held, codes, strict=True)}
-    latent = new.joined_codes([own.get(one.name) for one in new.members])
+    latent = own[""] if new is None else new.joined_codes([own.get(m.name) for m in new.members])
     return NamedPose(pose.name, latent, pins=pose.pins)
 
 

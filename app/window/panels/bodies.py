@@ -50,17 +50,20 @@ class BodiesPanel(QWidget):
     tree : a row for each body
     playing, clip, start : row with the selected body's clip and its start; shown if it has clips
     save : button that saves the scene
+    remove : button that takes the selected body out of the scene
 
     Signals
     -------
     hidden_changed : (F,) bool array, the faces of bodies that are not drawn, or None
     save_wanted : the scene is to be saved to a file
     clip_wanted : str, str, float: a body, the clip for it to play, and the start in seconds
+    removal_wanted : str: a body to take out of the scene
     """
 
     hidden_changed = Signal(object)
     save_wanted = Signal()
     clip_wanted = Signal(str, str, float)
+    removal_wanted = Signal(str)
     docking = Docking(
         "bodies",
         "&Bodies",
@@ -87,6 +90,9 @@ class BodiesPanel(QWidget):
         tip = "Save the scene: its files and their positions"
         self.save = push_button("Save scene…", tip)
         self.save.clicked.connect(self.save_wanted)
+        tip = "Take the chosen body out of the scene; its file stays"
+        self.remove = push_button("Remove", tip)
+        self.remove.clicked.connect(self._want_removal)
         self.clip = described(QComboBox(), "Which of its clips the chosen body plays", "Clip")
         self.start = described(
             QDoubleSpinBox(suffix=" s", decimals=2, maximum=3600.0, singleStep=0.1),
@@ -98,7 +104,7 @@ class BodiesPanel(QWidget):
         layout = QVBoxLayout(self)
         layout.addWidget(self.tree)
         layout.addWidget(self.playing)
-        layout.addWidget(self.save)
+        layout.addLayout(hbox(self.save, self.remove, spacing=TIGHT))
         self.tree.itemChanged.connect(self._on_changed)
         self.tree.currentItemChanged.connect(self._show_clip)
         self.clip.activated.connect(self._want_clip)
@@ -164,6 +170,8 @@ class BodiesPanel(QWidget):
         name = "" if row is None else row.text(_NAME)
         played = None if scene is None else scene.plays.get(name)
         self.playing.setVisible(played is not None)
+        may_go = scene is not None and name and not scene.member(name).is_ground
+        self.remove.setEnabled(bool(may_go))
         if scene is None or played is None:
             return
         with QSignalBlocker(self.clip), QSignalBlocker(self.start):
@@ -180,6 +188,11 @@ class BodiesPanel(QWidget):
         name, choice = row.text(_NAME), (self.clip.currentText(), self.start.value())
         if scene.plays.get(name, choice) != choice:
             self.clip_wanted.emit(name, *choice)
+
+    @Slot()
+    def _want_removal(self) -> None:
+        if self.scene is not None and (row := self.tree.currentItem()) is not None:
+            self.removal_wanted.emit(row.text(_NAME))
 
     def _rows(self) -> list[QTreeWidgetItem]:
         rows = map(self.tree.topLevelItem, range(self.tree.topLevelItemCount()))

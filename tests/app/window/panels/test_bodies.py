@@ -277,3 +277,38 @@ def test_a_further_body_stands_beside_what_is_open(hero: Path) -> None:
     more = open_scene_file(kept_scene(with_body(scene, "", hero)))
     assert [member.name for member in more.members] == ["hero", "hero 2", "hero 3"]
     assert as_scene(body) is None
+
+
+def test_a_body_is_removed_and_the_others_keep_their_pose(
+    qtbot: QtBot, hero: Path, tmp_path: Path
+) -> None:
+    scene = open_scene_file(kept_scene(scene_of_files([hero, hero, hero])))
+    window = open_window(qtbot, PoseDocument(scene), settings_in(tmp_path))
+    document, tree = window.document, window.bodies.tree
+    pose = 0.01 * np.arange(scene.latent_size) / scene.latent_size
+    for code, value in enumerate(pose):
+        document.motion.set_code(code, float(value))
+    posed = {name: scene.codes_of_member(name, document.history.latent) for name in scene.faces_of}
+    assert scene.file is not None
+    places = [part.at for part in scene.file.bodies]
+
+    def remove(row: int) -> None:
+        tree.setCurrentItem(tree.topLevelItem(row))
+        with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+            window.bodies.remove.click()
+
+    remove(1)
+    pair = as_scene(document.model)
+    assert pair is not None
+    assert [member.name for member in pair.members] == ["hero", "hero 3"]
+    assert pair.file is not None
+    assert [part.at for part in pair.file.bodies] == [places[0], places[2]]
+    for name in ("hero", "hero 3"):
+        codes = pair.codes_of_member(name, document.history.latent)
+        np.testing.assert_array_equal(codes, posed[name])
+    remove(0)
+    # What is left is no scene.
+    assert as_scene(document.model) is None
+    assert document.model.fingerprint == open_body(hero).fingerprint
+    np.testing.assert_array_equal(document.history.latent, posed["hero 3"])
+    assert window.docks["bodies"].isHidden()
