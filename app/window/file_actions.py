@@ -209,7 +209,7 @@ class FileActions(QObject):
         from lcollision_core.files.motion.generated import is_generated
         from lcollision_core.files.motion.smpl import is_smpl_motion
 
-        self._dropped = None
+        self._dropped = self._pose_to_restore = None
         suffix = path.suffix.lower()
         if is_learned_from(path):
             self.learning_wanted.emit((path,))

@@ -27,7 +27,7 @@ from pytestqt.qtbot import QtBot
 from app.editing.document import PoseDocument
 from app.window import file_actions
 from app.window.dialogs.forms import SceneExportDialog
-from app.window.dialogs.questions import ask_to_join
+from app.window.dialogs.questions import FailureDialog, ask_to_join
 from app.window.main_window import MainWindow
 from app.window.widgets import NameLabel
 from lcollision_core.bodies import Body, as_scene, open_body
@@ -312,3 +312,23 @@ def test_a_body_is_removed_and_the_others_keep_their_pose(
     assert document.model.fingerprint == open_body(hero).fingerprint
     np.testing.assert_array_equal(document.history.latent, posed["hero 3"])
     assert window.docks["bodies"].isHidden()
+
+
+def test_a_scene_that_cannot_be_opened_leaves_no_pose_to_the_next_body(
+    qtbot: QtBot, hero: Path, tmp_path: Path
+) -> None:
+    lost = Path(shutil.copy(hero, tmp_path / "lost.glb"))
+    scene = open_scene_file(kept_scene(scene_of_files([hero, lost])))
+    window = open_window(qtbot, PoseDocument(scene), settings_in(tmp_path))
+    document = window.document
+    for code in range(scene.latent_size):
+        document.motion.set_code(code, 0.01)
+    lost.unlink()
+    with qtbot.waitSignal(document.failed, timeout=PATIENCE):
+        window.files.remove_from_scene("hero")
+    for dialog in window.findChildren(FailureDialog):
+        dialog.reject()
+    document.history.mark_saved()
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        window.files.open_path(hero)
+    assert not document.history.latent.any()
