@@ -653,8 +653,7 @@ class FaceHighlight:
 
     def copy_from(self, other: FaceHighlight) -> None:
         """Show the faces of another highlight of the same mesh."""
-        self._polydata.SetPolys(other._polydata.GetPolys())
-        self._set_visible(other.n_faces > 0)
+        self.show(other._shown)
 
     @property
     def n_faces(self) -> int:

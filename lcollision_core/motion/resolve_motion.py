@@ -726,6 +726,9 @@ class _Resolution:
 
     def _jerk(self, span: range) -> dict[int, Reason]:
         """Return the colliding frame nearest to the worst jerk that correcting a span adds."""
+        if not self._easing:
+            # The motion jumps at both ends of each span.
+            return {}
         at = np.arange(span.start - 2, span.stop + 2)
         at = at % self.n if self.is_cycle else at[(at >= 0) & (at < self.n)]
         # At the ends of the frames that may change, the motion may have to jump.
@@ -738,8 +741,7 @@ class _Resolution:
         )
         colliding = np.flatnonzero(self.colliding[at])
         most = max(_JERK * (NOMINAL_RATE / self.motion.rate) ** 2, _JERKIER * before.max(initial=0))
-        # Without easing, the motion jumps at both ends of each span.
-        if not self._easing or not len(colliding) or after.max(initial=0.0) <= most:
+        if not len(colliding) or after.max(initial=0.0) <= most:
             return {}
         nearest = colliding[np.abs(colliding - 1 - after.argmax()).argmin()]
         return {int(at[nearest]): Reason.JERKS}
