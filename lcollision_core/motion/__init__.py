@@ -2,6 +2,7 @@
 
 from lcollision_core.motion.contacts import ContactReport, KeptContacts
 from lcollision_core.motion.frames import (
+    FrameChecks,
     FrameCollisions,
     KeptSpan,
     Reason,

@@ -203,14 +203,13 @@ class Frames:
                 return
         # With placements, or if `continuous`, interpolate the vertices.
         ends = (motion.check(at, self._check_between) for at in (frame, frame + 1))
-        meshes = (
+        first, second = (
             end_check.exported(end_check.decode(row)[0])
             for end_check, row in zip(ends, (start, end), strict=True)
         )
-        first, second = meshes
-        blended_codes, place = (1.0 - share) * first + share * second, check.placement
-        blended_codes = blended_codes if place is None else place.inverse().apply(blended_codes)
-        shaped = check.space.shaped_as(codes, blended_codes.astype(np.float64) / check.body_size)
+        vertices, place = (1.0 - share) * first + share * second, check.placement
+        vertices = vertices if place is None else place.inverse().apply(vertices)
+        shaped = check.space.shaped_as(codes, vertices.astype(np.float64) / check.body_size)
         yield replace(check, space=shaped), codes
 
     def are_free(
@@ -496,42 +495,84 @@ def colliding_domains(
     return tuple(divmod(pair, n_domains) for pair in ordered)
 
 
+@dataclass(frozen=True, eq=False)
+class FrameChecks:
+    """How the frames of a motion are made and checked; its functions are thread-safe.
+
+    Attributes
+    ----------
+    mesh : returns (V, 3) vertices of a frame, or of a pose a share of the way to the next
+    find : the exact check of vertices, which takes `counted_only`
+    measure : returns where vertices come nearest to each other; None if that is not asked
+    touches : returns whether a free frame touches itself on the linear path to the next; None if
+        that is not asked
+    seen : returns the check of one frame, or of two and the poses between, which replaces `find`,
+        `measure` and `touches` if frames hide faces
+    collide : returns which of several frames, or of poses a share of the way to the next, collide,
+        faster than `find`, and maybe their vertices
+    """
+
+    mesh: Callable[[int, float], npt.NDArray[np.floating]]
+    find: Callable[..., SelfCollisions]
+    measure: Callable[[npt.NDArray[np.floating]], NearestPair | None] | None = None
+    touches: Callable[[npt.NDArray[np.floating], npt.NDArray[np.floating]], bool] | None = None
+    seen: Callable[[range], ExactCheck] | None = None
+    collide: Callable[[Sequence[int], float], _Verdicts] | None = None
+
+    def of(self, frames: range) -> FrameChecks:
+        """Return the checks without the faces that any of the frames hides."""
+        if self.seen is None:
+            return self
+        check = self.seen(frames)
+        return replace(
+            self,
+            find=check.find,
+            measure=self.measure and check.least_distance,
+            touches=self.touches and check.collide_between,
+        )
+
+    def colliding_after(self, frames: Sequence[int], shares: Sequence[float]) -> list[int]:
+        """Return the frames of which a pose, a share of the way to the next, collides."""
+        if self.collide is not None:
+            hits = [np.compress(self.collide(frames, share)[0], frames) for share in shares]
+            return sorted({int(frame) for some in hits for frame in some})
+
+        def collides(frame: int) -> bool:
+            find = self.of(range(frame, frame + 2)).find
+            return any(find(self.mesh(frame, at), counted_only=True).colliding for at in shares)
+
+        return list(filter(collides, frames))
+
+    def touches_after(self, frame: int) -> bool:
+        """Whether something touches on the linear path from a free frame to the next."""
+        touches = self.of(range(frame, frame + 2)).touches
+        return touches is not None and touches(self.mesh(frame, 0.0), self.mesh(frame + 1, 0.0))
+
+
 def screen_frames(
-    mesh: Callable[[int, float], npt.NDArray[np.floating]],
+    checks: FrameChecks,
     times: npt.NDArray[np.float64],
-    find: Callable[..., SelfCollisions],
     vertex_domain: npt.NDArray[np.intp],
     faces: npt.NDArray[np.int32],
     substeps: int = 1,
     workers: int | None = None,
     job: Job = UNWATCHED,
-    measure: Callable[[npt.NDArray[np.floating]], NearestPair | None] | None = None,
-    touches: Callable[[npt.NDArray[np.floating], npt.NDArray[np.floating]], bool] | None = None,
-    estimated_free: npt.NDArray[np.bool_] | None = None,
-    seen: Callable[[range], ExactCheck] | None = None,
-    collide: Callable[[Sequence[int], float], _Verdicts] | None = None,
     *,
+    estimated_free: npt.NDArray[np.bool_] | None = None,
     counted_only: bool = True,
 ) -> ScreenedMotion:
     """Check frames exactly, and poses between them.
 
     Parameters
     ----------
-    mesh : returns (V, 3) vertices of a frame, or of a pose a share of the way to the next
+    checks : of the T frames
     times : (T,) of the frames, in seconds
-    find : the exact check of vertices, which takes `counted_only`; thread-safe
     vertex_domain : (V,) the part that each vertex belongs to
     faces : (F, 3) of the mesh
     substeps : >= 0, number of evenly spaced poses between two free frames
     workers : threads, one for each available core by default
     job : reports (frames done, T); polled for each frame
-    measure : returns where vertices come nearest to each other; thread-safe
-    touches : returns whether a free frame touches itself on the linear path to the next
     estimated_free : (T,) frames taken as free without a check; None for none
-    seen : returns the check of one frame, or of two and the poses between, which replaces `find`,
-        `measure` and `touches` if frames hide faces
-    collide : returns which of several frames, or of poses a share of the way to the next, collide,
-        faster than `find`, and maybe their vertices; thread-safe
     counted_only : whether to leave out the pairs that the contact rules exclude; if not, they are
         looked for in every n-th frame: see `ExcludedPairs.step_for`
 
@@ -549,75 +590,50 @@ def screen_frames(
 
     def screened_block(frames: range) -> list[FrameCollisions | None]:
         left = [at for at in frames if estimated_free is None or not estimated_free[at]]
-        frames_to_measure = [at for at in left if not is_searched(at)] if measure is None else []
+        quick = [at for at in left if not is_searched(at)] if checks.measure is None else []
         posed: dict[int, npt.NDArray[np.floating]] = {}
-        if collide is not None and frames_to_measure:
-            collides, meshes = collide(frames_to_measure, 0.0)
-            free = set(np.compress(~collides, frames_to_measure).tolist())
+        if checks.collide is not None and quick:
+            collides, meshes = checks.collide(quick, 0.0)
+            free = set(np.compress(~collides, quick).tolist())
             left = [at for at in left if at not in free]
-            posed = {} if meshes is None else dict(zip(frames_to_measure, meshes, strict=True))
+            posed = {} if meshes is None else dict(zip(quick, meshes, strict=True))
         return [screened(at, posed.get(at)) if at in left else None for at in frames]
 
     def screened(frame: int, vertices: npt.NDArray[np.floating] | None) -> FrameCollisions | None:
         job.check()
-        vertices = mesh(frame, 0.0) if vertices is None else vertices
-        frame_vertices = None if seen is None else seen(range(frame, frame + 1))
-        collisions = (find if frame_vertices is None else frame_vertices.find)(
-            vertices, counted_only=not is_searched(frame)
-        )
+        vertices = checks.mesh(frame, 0.0) if vertices is None else vertices
+        of_frame, seconds = checks.of(range(frame, frame + 1)), float(times[frame])
+        collisions = of_frame.find(vertices, counted_only=not is_searched(frame))
         if is_searched(frame):
             deepest = float(collisions.excluded_depth.max(initial=0.0))
-            searched[frame] = FrameExclusions(
-                frame, float(times[frame]), collisions.excluded, deepest
-            )
-        nearest_of = (
-            measure if frame_vertices is None or measure is None else frame_vertices.least_distance
-        )
-        if nearest_of is not None and (pair := nearest_of(vertices)) is not None:
+            searched[frame] = FrameExclusions(frame, seconds, collisions.excluded, deepest)
+        if of_frame.measure is not None and (pair := of_frame.measure(vertices)) is not None:
             nearest[frame] = pair.distance
         if not collisions.colliding:
             return None
-        return FrameCollisions(
-            frame,
-            float(times[frame]),
-            len(collisions.pairs),
-            float(collisions.penetration_depth.max()),
-            colliding_domains(collisions, vertex_domain, faces),
-        )
+        domains = colliding_domains(collisions, vertex_domain, faces)
+        n_pairs = len(collisions.pairs)
+        return FrameCollisions(frame, seconds, n_pairs, collisions.deepest, domains)
 
-    def collides_after(frames: Sequence[int]) -> list[int]:
+    def collide_after(frames: Sequence[int]) -> list[int]:
         job.check()
-        if collide is not None:
-            hits = [np.compress(collide(frames, at)[0], frames) for at in shares if len(frames)]
-            return sorted({int(frame) for some in hits for frame in some})
-        return [frame for frame in frames if one_collides_after(frame)]
-
-    def one_collides_after(frame: int) -> bool:
-        of_both = find if seen is None else seen(range(frame, frame + 2)).find
-        between = (of_both(mesh(frame, share), counted_only=True) for share in shares)
-        return any(collisions_there.colliding for collisions_there in between)
+        return checks.colliding_after(frames, shares)
 
     def touch_after(frames: Sequence[int]) -> list[int]:
-        return [frame for frame in frames if touches_after(frame)]
-
-    def touches_after(frame: int) -> bool:
         job.check()
-        if touches is None:
-            return False
-        of_both = touches if seen is None else seen(range(frame, frame + 2)).collide_between
-        return of_both(mesh(frame, 0.0), mesh(frame + 1, 0.0))
+        return list(filter(checks.touches_after, frames))
 
     n, n_threads = len(times), workers or available_cores()
     size = block_size(n, len(faces), max(1, min(_BLOCK, n // (4 * n_threads))))
-    collisions: list[FrameCollisions | None] = []
+    verdicts: list[FrameCollisions | None] = []
     with ThreadPoolExecutor(n_threads, "screening") as pool:
         for block in pool.map(screened_block, _blocks(range(n), size)):
-            collisions += block
-            job.report(len(collisions), n)
-        free = [at for at in range(n - 1) if collisions[at] is None and collisions[at + 1] is None]
+            verdicts += block
+            job.report(len(verdicts), n)
+        free = [at for at in range(n - 1) if verdicts[at] is None and verdicts[at + 1] is None]
         between, on_path = (
             tuple(at for block in pool.map(of, _blocks(free, size)) for at in block)
-            for of in (collides_after, touch_after)
+            for of in (collide_after, touch_after)
         )
     excluded = tuple(searched[frame] for frame in sorted(searched))
     left_out = ExcludedPairs(step=step)
@@ -625,9 +641,9 @@ def screen_frames(
         left_out = left_out.with_frame(frame.frame, frame.counts, frame.deepest)
     least = min(nearest, key=lambda frame: (nearest[frame], frame), default=None)
     return ScreenedMotion(
-        tuple(collisions_of for collisions_of in collisions if collisions_of is not None),
+        tuple(filter(None, verdicts)),
         between,
-        None if touches is None else on_path,
+        None if checks.touches is None else on_path,
         None if least is None else nearest[least],
         least,
         left_out,
@@ -666,20 +682,23 @@ def screen_motion(
         meshes = motion.meshes(frames, check)
         return ~unplaced.are_free_meshes(meshes), meshes
 
-    return screen_frames(
+    checks = FrameChecks(
         lambda frame, share: motion.vertices(frame, check, share),
-        motion.times,
         check.find,
+        check.least_distance if check.clearance > 0.0 else None,
+        check.collide_between if continuous else None,
+        None if motion.hidden is None else partial(motion.seen, check),
+        collide if motion.hidden is None else None,
+    )
+    return screen_frames(
+        checks,
+        motion.times,
         space.vertex_domain,
         space.topology.faces,
         substeps,
         workers,
         job,
-        check.least_distance if check.clearance > 0.0 else None,
-        check.collide_between if continuous else None,
-        estimated_free,
-        None if motion.hidden is None else partial(motion.seen, check),
-        collide if motion.hidden is None else None,
+        estimated_free=estimated_free,
         counted_only=counted_only,
     )
 

@@ -42,6 +42,7 @@ from lcollision_core.meshes import STRICT, ContactRules, FaceGroup, Topology
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
 from lcollision_core.motion import (
     NOMINAL_RATE,
+    FrameChecks,
     Motion,
     ScreenedMotion,
     screen_frames,
@@ -319,19 +320,16 @@ def _check_meshes(path: Path, request: CheckRequest, job: Job) -> list[CheckedCl
         bound = max(DISTANCE_BOUND, request.clearance)
         parts, owner = body.parts
         times = np.arange(len(body.frames)) / rate
-        screened = screen_frames(
+        checks = FrameChecks(
             body.vertices_at,
-            times,
             detector.detect,
-            owner,
-            poses.topology.faces,
-            choice.substeps,
-            None,
-            job,
             partial(detector.least_distance, bound=bound) if request.clearance > 0.0 else None,
             detector.collide_between if choice.continuous else None,
             collide=partial(_collide, body, detector),
-            counted_only=False,
+        )
+        topology, substeps = poses.topology, choice.substeps
+        screened = screen_frames(
+            checks, times, owner, topology.faces, substeps, None, job, counted_only=False
         )
         name = clip or path.stem
         verdicts.append(_verdict(path, name, times, rate, screened, parts, detector.rules, request))

@@ -13,6 +13,7 @@ from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.motion import (
+    FrameChecks,
     Motion,
     MotionOptions,
     ScreenedMotion,
@@ -65,15 +66,13 @@ def test_boxes_that_pass_through_each_other_between_free_frames_are_found() -> N
     frames[:, 8:, 0] += np.array(places)[:, None]
 
     def screened(substeps: int, continuous: bool) -> ScreenedMotion:
-        return screen_frames(
+        checks = FrameChecks(
             lambda at, share: (1.0 - share) * frames[at] + share * frames[min(at + 1, 4)],
-            np.arange(5) / 30.0,
             detector.detect,
-            np.zeros(len(mesh.vertices), dtype=np.intp),
-            mesh.topology.faces,
-            substeps,
             touches=detector.collide_between if continuous else None,
         )
+        owner = np.zeros(len(mesh.vertices), dtype=np.intp)
+        return screen_frames(checks, np.arange(5) / 30.0, owner, mesh.topology.faces, substeps)
 
     assert screened(0, continuous=True).collides_between == (1,)
     assert screened(0, continuous=True).in_between == ()

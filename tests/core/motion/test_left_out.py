@@ -9,7 +9,7 @@ import pytest
 
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.meshes import ContactRules, Topology
-from lcollision_core.motion import screen_frames
+from lcollision_core.motion import FrameChecks, screen_frames
 
 _BLADES = np.array(
     [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -0.5], [0.2, 0.2, 0.1], [0.3, 0.2, 0.1]], float
@@ -33,9 +33,8 @@ def test_a_search_for_what_does_not_count_stays_short_for_long_motions(
 
     screen = partial(
         screen_frames,
-        lambda frame, share: _BLADES,  # noqa: ARG005
+        FrameChecks(lambda frame, share: _BLADES, find),  # noqa: ARG005
         np.arange(n_frames) / 30.0,
-        find,
         np.zeros(6, dtype=np.intp),
         faces,
         substeps=0,
