@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import ShapeError, listed
 from lcollision_core.json_values import from_json, to_json
-from lcollision_core.sentences import say, say_number
+from lcollision_core.sentences import counted, say, say_number
 
 CHARACTER_REST_EXCLUSION = 0.02
 """Normalised length: the rest exclusion of characters, found by measurements on several."""
@@ -139,11 +139,20 @@ class ExcludedPairs:
         sentence = rules.sentence(self.counts)
         if not self.frames:
             return sentence
-        frames = "1 frame" if self.frames == 1 else f"{self.frames} frames"
+        frames = counted(self.frames, "frame", "frames")
         if self.step > 1:
-            frames = f"{self.frames} of {self.searched} frames that were searched for all pairs"
-        deep = f"up to {100.0 * self.deepest:.3g} % of the body size deep in frame {self.frame}"
-        return f"in {frames} {sentence}, {deep}"
+            frames = say(
+                "{n} of {all} frames that were searched for all pairs",
+                n=self.frames,
+                all=self.searched,
+            )
+        return say(
+            "in {frames} {pairs}, up to {depth:.3g} % of the body size deep in frame {frame}",
+            frames=frames,
+            pairs=sentence,
+            depth=100.0 * self.deepest,
+            frame=self.frame,
+        )
 
 
 @dataclass(frozen=True)
@@ -265,7 +274,7 @@ class ContactRules:
         """Describe the excluded pairs, as in "pairs that touch at rest"; empty if all count."""
         groups = listed(map(pair_in_words, self.ignored), _NAMED_PAIRS)
         around = f" or within {self.rest_exclusion:g} of such a pair" if self.rest_exclusion else ""
-        left_out = self.left_out_in_words().removeprefix("without ")
+        left_out = listed(self.left_out, _NAMED_PAIRS)
         descriptions = (
             left_out and f"pairs of parts left out ({left_out})",
             self.near_exclusion and f"pairs {self._near_in_words()}",
@@ -328,51 +337,35 @@ class ContactRules:
         if len(self.ignored) > _NAMED_PAIRS:
             groups = f"{len(self.ignored)} ignored pairs of groups"
         near, depth = self._near_in_words(), self._tolerated_in_words()
+        # In the order of `RuleCounts`.
         texts = (
-            (
-                counts.near,
-                say_number(counts.near, "{n} pair {near}", "{n} pairs {near}", near=near),
+            say_number(counts.near, "{n} pair {near}", "{n} pairs {near}", near=near),
+            say_number(
+                counts.rest, "{n} pair that touches at rest", "{n} pairs that touch at rest"
             ),
-            (
-                counts.rest,
-                say_number(
-                    counts.rest, "{n} pair that touches at rest", "{n} pairs that touch at rest"
-                ),
+            say_number(
+                counts.ignored, "{n} pair of {groups}", "{n} pairs of {groups}", groups=groups
             ),
-            (
-                counts.ignored,
-                say_number(
-                    counts.ignored, "{n} pair of {groups}", "{n} pairs of {groups}", groups=groups
-                ),
-            ),
-            (
+            say_number(
                 counts.tolerated,
-                say_number(
-                    counts.tolerated,
-                    "{n} pair not deeper than {depth}",
-                    "{n} pairs not deeper than {depth}",
-                    depth=depth,
-                ),
+                "{n} pair not deeper than {depth}",
+                "{n} pairs not deeper than {depth}",
+                depth=depth,
             ),
-            (counts.joint, say_number(counts.joint, "{n} pair at a joint", "{n} pairs at joints")),
-            (
+            say_number(counts.joint, "{n} pair at a joint", "{n} pairs at joints"),
+            say_number(
                 counts.touching,
-                say_number(
-                    counts.touching,
-                    "{n} pair at places that nearly always touch",
-                    "{n} pairs at places that nearly always touch",
-                ),
+                "{n} pair at places that nearly always touch",
+                "{n} pairs at places that nearly always touch",
             ),
-            (
+            say_number(
                 counts.shape,
-                say_number(
-                    counts.shape,
-                    "{n} pair at places that a shape brings into contact",
-                    "{n} pairs at places that a shape brings into contact",
-                ),
+                "{n} pair at places that a shape brings into contact",
+                "{n} pairs at places that a shape brings into contact",
             ),
         )
-        *others, last = [text for number, text in texts if number] or [""]
+        numbers = counts.to_json().values()
+        *others, last = [text for n, text in zip(numbers, texts, strict=True) if n] or [""]
         if not last:
             return left_out
         pairs_text = say("{some} and {last}", some=", ".join(others), last=last) if others else last
