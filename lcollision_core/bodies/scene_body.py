@@ -297,7 +297,7 @@ class SceneBody(Body):
         tolerated: list[tuple[str, str, float]] = []
         touching: list[tuple[int, int]] = []
         in_shapes: list[tuple[int, int]] = []
-        bending = [member.body for member in self.members if member.moves and _bends(member.body)]
+        bending = [member.body for member in self.members if member.moves and bends(member.body)]
         # Joints crease what they turn: without their exclusions characters collide at rest.
         jointed = [body for body in bending if body.joints is not None]
         posed = [body.rules for body in jointed or bending]
@@ -308,7 +308,7 @@ class SceneBody(Body):
             own = {group.name for group in member.body.groups}
             everyone = np.arange(rows.start, rows.stop)
             groups.append(FaceGroup(name, everyone))
-            is_prop = member.holder is not None or (member.moves and not _bends(member.body))
+            is_prop = member.holder is not None or (member.moves and not bends(member.body))
             for group in member.body.groups:
                 if is_prop and len(group.faces) == len(everyone):
                     continue  # The prop's name says it: not "sword: Sword".
@@ -706,7 +706,7 @@ class SceneBody(Body):
         """The bodies that bend and are not fixed, by name, each with the props that it holds."""
         alone = {}
         for at, member in enumerate(self.standing):
-            if not member.moves or member.is_fixed or not _bends(member.body):
+            if not member.moves or member.is_fixed or not bends(member.body):
                 continue
             body, place = member.body, self._space.members[at].place
             if not body.can_resolve:
@@ -812,8 +812,8 @@ class SceneResolver(PoseResolver):
         return np.concatenate([self._starts(target, self.check), super()._known_free(target)])
 
 
-def _bends(body: Body) -> bool:
-    """Whether a posable body has parts that move relative to each other."""
+def bends(body: Body) -> bool:
+    """Whether a posable body has parts that move relative to each other; a prop has none."""
     return len(body.space.low) > body.space.group_sizes[0]
 
 

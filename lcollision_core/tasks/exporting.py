@@ -37,7 +37,7 @@ from lcollision_core.bodies.motions import (
     write_new_clips,
 )
 from lcollision_core.bodies.retargeting import require_skeleton
-from lcollision_core.bodies.scene_body import SceneMember
+from lcollision_core.bodies.scene_body import SceneMember, bends
 from lcollision_core.errors import LCollisionError, MeshFileError, listed
 from lcollision_core.files import (
     FileStamp,
@@ -722,42 +722,19 @@ def write_members(
     MeshFileError : a file cannot be written.
     """
     stems = file_stems(pose.name for pose in poses) if len(poses) > 1 else [""]
-    written, n_files = [], 0
+    members, written = list(written_members(body, request.mesh_format)), []
     with atomic_files(folder) as unfinished:
         for pose, mesh, stem in zip(poses, vertices, stems, strict=True):
             target = unfinished / stem
             target.mkdir(exist_ok=True)
             stored, notes = np.array(mesh, dtype=np.float64), dict[str, None]()
-            for member, file in written_members(body, request.mesh_format):
-                path, member_body = target / file, member.body
-                back, rows = member.place.inverse(), body.vertices_of[member.name]
-                source = source_for(path.suffix, member_body)
-                member_request = request
-                if source is not None and member_body.latent_size <= 6:
-                    member_request = replace(
-                        request, form="obj" if path.suffix == ".obj" else "mesh"
-                    )
-                codes = (
-                    body.codes_of_member(member.name, pose.latent)
-                    if member.moves
-                    else np.zeros(member_body.latent_size)
-                )
-                done = write_pose(
-                    path,
-                    member_body,
-                    codes,
-                    back.apply(mesh[rows]),
-                    None,
-                    member_request,
-                    source=source,
-                )
-                frame = export_frame(member_body, member_request.axes, path, member_request.scale)
-                if source is not None and source.frame is not None:
-                    frame = source.frame
-                assert done.vertices is not None
-                stored[rows] = member.place.apply(frame.inverse().apply(done.vertices))
-                notes |= dict.fromkeys(f"{member.name}: {sentence}" for sentence in done.notes)
-                n_files += 1
+            for member, file in members:
+                rows, codes = body.vertices_of[member.name], np.zeros(member.body.latent_size)
+                if member.moves:
+                    codes = body.codes_of_member(member.name, pose.latent)
+                of_member = _write_member(target / file, member, codes, mesh[rows], request)
+                stored[rows] = of_member.vertices
+                notes |= dict.fromkeys(f"{member.name}: {text}" for text in of_member.notes)
             written.append(WrittenPose(folder / stem, stored, 1.0, tuple(notes)))
     for sentence in dict.fromkeys(sentence for pose in written for sentence in pose.notes):
         job.note(sentence)
@@ -765,11 +742,38 @@ def write_members(
         say(
             "wrote {poses} of {bodies} to {output}",
             poses=counted(len(poses), "pose", "poses"),
-            bodies=counted(n_files // len(poses), "body", "bodies"),
+            bodies=counted(len(members), "body", "bodies"),
             output=folder,
         )
     )
     return written
+
+
+def _write_member(
+    path: Path,
+    member: SceneMember,
+    codes: npt.NDArray[np.float64],
+    vertices: npt.NDArray[np.floating],
+    request: ExportRequest,
+) -> WrittenPose:
+    """Write a pose of one body of a scene; return it in the scene's unit and coordinates.
+
+    Parameters
+    ----------
+    codes : (D_k,) of the body
+    vertices : (V_k, 3), in the scene
+    """
+    body, own_vertices = member.body, member.place.inverse().apply(vertices)
+    source = source_for(path.suffix, body)
+    if source is not None and not bends(body):
+        request = replace(request, form="obj" if path.suffix == ".obj" else "mesh")
+    written = write_pose(path, body, codes, own_vertices, None, request, source=source)
+    frame = export_frame(body, request.axes, path, request.scale)
+    if source is not None and source.frame is not None:
+        frame = source.frame
+    assert written.vertices is not None
+    in_scene = member.place.apply(frame.inverse().apply(written.vertices))
+    return replace(written, vertices=in_scene, unit=1.0)
 
 
 def written_members(

@@ -28,7 +28,13 @@ from lcollision_core.bodies.motions import (
 )
 from lcollision_core.bodies.names import unique_names
 from lcollision_core.bodies.poses import OtherModelError, read_poses
-from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember, ScenePart
+from lcollision_core.bodies.scene_body import (
+    SceneBody,
+    SceneFile,
+    SceneMember,
+    ScenePart,
+    bends,
+)
 from lcollision_core.bodies.scene_file import (
     beside,
     body_of_scene,
@@ -195,7 +201,7 @@ def carried_pose(pose: NamedPose, before: Body, after: Body, removed: str = "") 
         return pose
     old, new = as_scene(before), as_scene(after)
     posed, shown = (
-        [("", body)] if scene is None else [(one.name, one.body) for one in scene.standing]
+        [("", body)] if scene is None else [(member.name, member.body) for member in scene.standing]
         for scene, body in ((old, before), (new, after))
     )
     own: dict[str, npt.NDArray[np.float64]] = {}
@@ -387,22 +393,14 @@ def scene_motion(
         file, clip, seconds = asked_clips[member.name]
         motion = read_motions(member.body, file, clip, rate, job.part())[0].at_rate(rate)
         motions.append(PlayedMotion(member, motion, file, round(seconds * rate)))
-    moving = [(played, played.motion) for played in motions if played.motion is not None]
-    n = max(played.start + len(motion) for played, motion in moving)
-    codes_of = {played.member.name: motion.codes[played.frames(n)] for played, motion in moving}
-    codes = np.array(
-        [
-            body.joined_codes(
-                [
-                    codes_of[member.name][frame] if member.name in codes_of else None
-                    for member in body.members
-                ]
-            )
-            for frame in range(n)
-        ]
-    )
+    moving = [(of_body, of_body.motion) for of_body in motions if of_body.motion is not None]
+    n = max(of_body.start + len(motion) for of_body, motion in moving)
+    codes_of = {of_body.member.name: motion.codes[of_body.frames(n)] for of_body, motion in moving}
+    still = [None] * n
+    rows = zip(*(codes_of.get(member.name, still) for member in body.members), strict=True)
+    codes = np.array([body.joined_codes(row) for row in rows])
     names = " + ".join(dict.fromkeys(motion.name for _, motion in moving))
-    files = dict.fromkeys(played.file.name for played, _ in moving if played.file is not None)
+    files = dict.fromkeys(of_body.file.name for of_body, _ in moving if of_body.file is not None)
     space_at = _space_at(body, moving)
     return Motion(names, np.arange(n) / rate, codes, None, space_at, " + ".join(files)), motions
 
@@ -496,7 +494,7 @@ def write_member_motions(
     for member, file in written_members(body):
         played_motion, path = by_name.get(member.name), folder / file
         own_file = member.body.own_file
-        is_character = played_motion is not None and member.body.latent_size > 6
+        is_character = played_motion is not None and bends(member.body)
         if not is_character or own_file is None or own_file.suffix.lower() not in SCENE_SUFFIXES:
             rows, back = body.vertices_of[member.name], member.place.inverse()
             path = path.with_suffix(".pc2")
@@ -540,11 +538,16 @@ def files_of_members(
     ------
     LCollisionError : one of them is a source file of the scene.
     """
-    files = [folder / file for _, file in written_members(body, mesh_format)]
-    if of_motion:
-        files += [file.with_suffix(".pc2") for file in files]
-    refuse_to_replace(files, source_files(body), in_place=False)
+    files = _files_of_members(folder, body, mesh_format, of_motion=of_motion)
+    refuse_to_replace(files, source_files(body))
     return files
+
+
+def _files_of_members(
+    folder: Path, body: SceneBody, mesh_format: str | None = None, *, of_motion: bool
+) -> list[Path]:
+    files = [folder / file for _, file in written_members(body, mesh_format)]
+    return files + [file.with_suffix(".pc2") for file in files if of_motion]
 
 
 def export_scene_pose(
@@ -594,8 +597,7 @@ def resolve_scene_motion(
         )
     outputs = [output.path]
     if output.form == "folder":
-        files = [output.path / file for _, file in written_members(body)]
-        outputs = [*files, *(file.with_suffix(".pc2") for file in files)]
+        outputs = _files_of_members(output.path, body, of_motion=True)
     read = [played_motion.file for played_motion in of_bodies if played_motion.file is not None]
     refuse_to_replace(outputs, [*read, *source_files(body)], in_place=in_place)
     with run_of_motions(request, [motion], job) as run:
