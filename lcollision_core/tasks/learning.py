@@ -562,7 +562,7 @@ class _Learner:
         spent = work.status.seconds
         self._before = {str(stage): float(spent.get(stage, 0.0)) for stage in STAGES}
         self._stage, self._began = Stage.POSES, time.monotonic()
-        self._noted = -np.inf
+        self._noted, self._newest = -np.inf, work.status
 
     def run(self) -> LearnedCard:
         work = self._work
@@ -746,6 +746,7 @@ class _Learner:
         self._pace.report(self._stage, stage_done, facts)
 
     def _tell(self, status: LearningStatus) -> None:
+        self._newest = status
         self._job.report(status)
         now = time.monotonic()
         if now - self._noted > _SECONDS_BETWEEN_NOTES:
@@ -756,6 +757,6 @@ class _Learner:
 
     def _leave(self, state: RunState, sentence: str = "", **more: Any) -> None:
         """Write the final status, unless the disk is too full even for that."""
-        last = replace(self._work.status, seconds=self._seconds(), seconds_left=None)
+        last = replace(self._newest, seconds=self._seconds(), seconds_left=None)
         with suppress(MeshFileError):
             self._work.write_status(replace(last, state=state, sentence=sentence, **more))

@@ -16,6 +16,7 @@ from lcollision_core.errors import LabelStoreError, ModelFileError
 from lcollision_core.files import PoseSet, write_pose_set
 from lcollision_core.learning_state import RunState, Stage
 from lcollision_core.options import LearningRequest, Quality
+from lcollision_core.tasks import learning
 from lcollision_core.tasks.learning import (
     EFFORTS,
     MostlyCollidingError,
@@ -96,8 +97,10 @@ def test_the_box_is_made_smaller_but_never_than_the_poses_and_rules_of_the_reque
 
 
 def test_a_run_stops_before_the_predictor_where_nearly_all_samples_collide(
-    tmp_path: Path, touching_file: str
+    tmp_path: Path, touching_file: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # The last status is the newest one, not the last that was written on the way.
+    monkeypatch.setattr(learning, "_SECONDS_BETWEEN_NOTES", 1e9)
     request = replace(STRICT, sources=(touching_file,))
     work = work_in(tmp_path, request)
     with pytest.raises(MostlyCollidingError, match=r"100 % of the first 1024 samples .* collide"):
