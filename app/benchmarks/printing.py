@@ -46,17 +46,17 @@ _ASIDE = 0.5137
 """Offset of the rays, in column widths: an irregular number that avoids edges of a mesh."""
 
 
-def column_volume(parts: Sequence[ClosedMesh], columns: int = _COLUMNS) -> float:
+def column_volume(parts: Sequence[ClosedMesh]) -> float:
     """Return the volume of the union of closed meshes, which may cross themselves.
 
-    A ray along z near the middle of each of `columns` x `columns` columns gives the exact length
+    A ray along z near the middle of each of `_COLUMNS` squared columns gives the exact length
     with a non-zero winding number; the volume is the sum of the lengths times a column's area.
     """
     low = np.min([vertices.min(axis=0) for vertices, _ in parts], axis=0)
     size = np.max([vertices.max(axis=0) for vertices, _ in parts], axis=0) - low
     crossings: list[FloatArray] = []
     for vertices, faces in parts:
-        corners = (vertices[faces] - low) / [*(size[:2] / columns), 1.0]
+        corners = (vertices[faces] - low) / [*(size[:2] / _COLUMNS), 1.0]
         first = np.ceil(corners[:, :, :2].min(axis=1) - _ASIDE).astype(int)
         count = np.floor(corners[:, :, :2].max(axis=1) - _ASIDE).astype(int) + 1 - first
         cells = np.maximum(count, 0).prod(axis=1)
@@ -71,7 +71,7 @@ def column_volume(parts: Sequence[ClosedMesh], columns: int = _COLUMNS) -> float
         area = shares.sum(axis=1)
         hit = ((shares * np.sign(area)[:, None] >= 0.0).all(axis=1)) & (area != 0.0)
         z = np.einsum("nk,nk->n", shares, corners[face][:, :, 2])[hit] / area[hit]
-        column = (at @ [columns, 1])[hit]
+        column = (at @ [_COLUMNS, 1])[hit]
         order = np.lexsort((z, column))
         winding = _sums(column[order], np.sign(area[hit])[order]) != 0.0
         was = np.concatenate([[False], winding[:-1]])
@@ -81,7 +81,7 @@ def column_volume(parts: Sequence[ClosedMesh], columns: int = _COLUMNS) -> float
     order = np.lexsort((z, column))
     inside = _sums(column[order], change[order])[:-1] > 0.0
     inside &= np.diff(column[order]) == 0.0
-    return float(np.diff(z[order])[inside].sum() * (size[:2] / columns).prod())
+    return float(np.diff(z[order])[inside].sum() * (size[:2] / _COLUMNS).prod())
 
 
 def _area(one: FloatArray, other: FloatArray, at: FloatArray) -> FloatArray:

@@ -55,7 +55,7 @@ from lcollision_core.meshes.face_groups import (
     runs_to_faces,
     touching_groups,
 )
-from lcollision_core.meshes.topology import FloatArray, array_of
+from lcollision_core.meshes.topology import FloatArray, latent_array
 
 if TYPE_CHECKING:
     from lcollision_core.bodies.rig_poses import StarterPose
@@ -795,7 +795,7 @@ class Body(ABC):
         return groups + [FaceGroup(name, faces) for name, faces in domains]
 
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
-        codes = array_of(latent, "latent").astype(np.float64)
+        codes = latent_array(latent).astype(np.float64)
         if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
             raise ShapeError.must_be(
                 f"a latent pose of {self.name}",

@@ -69,7 +69,7 @@ def exclusions_of(
     ShapeError : the rules name an unknown group, a group has faces that the mesh lacks, or too
         many pairs are excluded.
     """
-    near = rest = no_lists(0)
+    near = rest = no_lists()
     if rules.near_exclusion > 0.0:
         surface, distance = surface_of(topology, reference), rules.near_exclusion * body_size
         creases = _creases(topology, reference, groups) if rules.near_by_limb else None
@@ -159,7 +159,7 @@ def _listed(
         rest,
         touching,
         shape,
-        lists_of(joints, n_faces) if joints else no_lists(0),
+        lists_of(joints, n_faces) if joints else no_lists(),
         region,
         ignored,
         squared_tolerance,
@@ -180,7 +180,7 @@ def _about(
 ) -> Lists:
     """List for each face the later ones near a partner of a touching face near it."""
     if not len(pairs):
-        return no_lists(0)
+        return no_lists()
     require = partial(require_listable, rule=rule)
     return faces_near_touching(surface_of(topology, reference), pairs, distance, require)
 

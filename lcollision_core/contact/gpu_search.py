@@ -168,14 +168,12 @@ class GpuSearch:
             job.report(start, len(poses))
         return left
 
-    def list_pairs(
-        self, poses: npt.NDArray[np.floating], uncounted: SkippableNodes = NO_TABLES
-    ) -> ListedPairs:
+    def list_pairs(self, poses: npt.NDArray[np.floating]) -> ListedPairs:
         """List the pairs of (B, V, 3) poses that penetrate; poses left to the CPU have none."""
         parts: list[ListedPairs] = []
         for start in range(0, len(poses), self.at_once):
             parts_here: list[ListedPairs] = []
-            self.search(poses[start : start + self.at_once], uncounted=uncounted, listed=parts_here)
+            self.search(poses[start : start + self.at_once], listed=parts_here)
             parts += [part._replace(pose=part.pose + start) for part in parts_here]
         pose, pairs, squared_depth, rule = map(np.concatenate, zip(*parts, strict=True))
         order = np.lexsort((pairs[:, 1], pairs[:, 0], pose))

@@ -61,9 +61,9 @@ class Creases(NamedTuple):
     joint_length: FloatArray
 
 
-def no_lists(n: int) -> Lists:
-    """Return n empty lists."""
-    return Lists(np.zeros(n + 1, dtype=np.int64), np.empty(0, dtype=np.int32))
+def no_lists() -> Lists:
+    """Return lists of no item, which exclude nothing."""
+    return Lists(np.zeros(1, dtype=np.int64), np.empty(0, dtype=np.int32))
 
 
 def lists_of(members: Sequence[npt.NDArray[np.integer]], n: int) -> Lists:
@@ -219,7 +219,7 @@ def _listed(
 
     for_blocks(work, n_lists, _LISTS_AT_ONCE)
     if not parts:
-        return no_lists(0)
+        return no_lists()
     counts, entries = zip(*(parts[first] for first in sorted(parts)), strict=True)
     start, entry = _starts(np.concatenate(counts)), np.concatenate(entries)
     # Numba takes two seconds to compile a sort; transposing twice takes half the time of SciPy's.

@@ -256,7 +256,7 @@ class UncountedTables:
 
 
 def make_uncounted(
-    tree: FaceTree, exclusions: Exclusions, keep_going: Callable[[], bool] = lambda: True
+    tree: FaceTree, exclusions: Exclusions, keep_going: Callable[[], bool]
 ) -> SkippableNodes | None:
     """Make the tables of a tree.
 

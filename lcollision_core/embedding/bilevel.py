@@ -28,7 +28,7 @@ from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.json_values import from_json
 from lcollision_core.meshes.alignment import fit_rigid
-from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, array_of
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, latent_array
 from lcollision_core.model_file import required_array
 
 MAX_STEPS = 20
@@ -592,7 +592,7 @@ class Embedding:
         ------
         ShapeError : another shape.
         """
-        rows = array_of(latent, "latent")
+        rows = latent_array(latent)
         if rows.ndim != 2 or rows.shape[1] != self.latent_size:
             raise ShapeError.must_be("latent", f"of shape (B, {self.latent_size})", rows.shape)
         vertices = np.empty((len(rows), self.topology.n_vertices, 3))

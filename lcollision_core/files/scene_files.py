@@ -58,14 +58,14 @@ def read_scene(source: str | os.PathLike[str] | SceneDocument, job: Job = UNWATC
         return scene_of(document)
 
 
-def read_skeleton_scene(path: str | os.PathLike[str], job: Job = UNWATCHED) -> Scene:
+def read_skeleton_scene(path: str | os.PathLike[str]) -> Scene:
     """Read only the nodes and clips of a file, which need not have a mesh.
 
     Raises
     ------
-    CancelledError, MeshFileError : see `open_scene`.
+    MeshFileError : see `open_scene`.
     """
-    document = open_scene(path, job)
+    document = open_scene(path)
     with as_file_error(path):
         if isinstance(document, FbxDocument):
             return fbx.read_nodes(document)

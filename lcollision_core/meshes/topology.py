@@ -20,8 +20,8 @@ _LEAST_LENGTH = 1e-12
 """Least length of an edge in a length graph."""
 
 
-def array_of(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
-    """Convert an argument to an array.
+def latent_array(values: npt.ArrayLike) -> npt.NDArray[Any]:
+    """Convert latent poses given by the caller to an array.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def array_of(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
             "is not an array of numbers",
             "pass a NumPy array, of a torch tensor `tensor.detach().cpu().numpy()`; gradients pass "
             "through `LearnedBody.torch_module()`",
-            where=name,
+            where="latent",
             got=type(values).__name__,
         ) from error
 

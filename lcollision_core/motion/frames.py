@@ -345,8 +345,8 @@ _FLICKER = 10.0
 def chain_corrections(
     frames: Frames,
     runs: Sequence[Sequence[int]],
-    before: FloatArray | None = None,
-    so_far: dict[int, FloatArray] | None = None,
+    before: FloatArray | None,
+    freed: dict[int, FloatArray],
 ) -> dict[int, FloatArray]:
     """Resolve colliding frames of each run in turn, forwards and backwards.
 
@@ -358,13 +358,12 @@ def chain_corrections(
     frames : of the motion
     runs : numbers of colliding frames, ascending
     before : (D,) correction of the frame before the first run; None if that is free
-    so_far : receives the corrections as frames are resolved, in case the work is stopped
+    freed : receives the corrections as frames are resolved, in case the work is stopped
 
     Returns
     -------
     corrections : (D,) by frame, of the frames that were resolved
     """
-    freed = {} if so_far is None else so_far
     ways: list[tuple[Iterable[int], FloatArray | None]] = []
     for number, run in enumerate(runs):
         ways += [(run, None if number else before), (reversed(run), None)]
@@ -382,14 +381,14 @@ def _chained(
     frames: Frames,
     order: Iterable[int],
     near: FloatArray | None,
-    so_far: dict[int, FloatArray],
+    freed: dict[int, FloatArray],
 ) -> dict[int, FloatArray]:
     chained: dict[int, FloatArray] = {}
     for frame in order:
         free = frames.resolved(frame, near)
         if free is not None:
             chained[frame] = near = free - frames.motion.codes[frame]
-            so_far.setdefault(frame, near)
+            freed.setdefault(frame, near)
     return chained
 
 

@@ -623,7 +623,7 @@ class SpanProgram:
         still : distance from a pose that was free within which a frame counts as free
         """
         poses = self._targets + corrections
-        n, frames = len(poses), self.frames
+        frames = self.frames
         watched = [at for at in np.flatnonzero(self._watched).tolist() if at not in pinned]
         asked = [
             at
@@ -637,9 +637,29 @@ class SpanProgram:
         known = {int(at): self._known[at].copy() for at in np.flatnonzero(self._is_known)}
         for _ in frames.pool.map(lambda at: self._meet(at, poses[at], known, resolves), colliding):
             pass
-        is_free = np.ones(n, dtype=np.bool_)
+        is_free = np.ones(len(poses), dtype=np.bool_)
         is_free[colliding] = False
-        is_whole = self._are_hopeless(~is_free)
+        self._pulls = {}
+        if frames.kept_contacts is not None:
+            pulled = frames.pool.map(frames.pulls, self.span, poses)
+            self._pulls = {at: pulls for at, pulls in enumerate(pulled) if pulls is not None}
+        between = self._look_between(poses, is_free, still)
+        n_apart = sum(pulls.n_apart for pulls in self._pulls.values())
+        lack = sum(pulls.lack for pulls in self._pulls.values())
+        return _Evaluation(corrections, is_free, between, n_apart, lack)
+
+    def _look_between(
+        self, poses: FloatArray, is_free: npt.NDArray[np.bool_], still: float
+    ) -> list[int]:
+        """Collect the contacts between free frames; return those before a colliding pose.
+
+        Parameters
+        ----------
+        poses : (n, D) codes of the frames
+        is_free : (n,) whether each frame is free
+        still : see `_look`
+        """
+        n, is_whole = len(poses), self._are_hopeless(~is_free)
         places = [
             (at, fraction)
             for at in range(n if self.is_cycle else n - 1)
@@ -658,16 +678,8 @@ class SpanProgram:
             if place not in self._clear
             or not self._is_near(middles[place], self._clear[place], still)
         ]
-        self._pulls = {}
-        for at, pulls in enumerate(
-            self.frames.pool.map(self.frames.pulls, self.span, poses)
-            if self.frames.kept_contacts is not None
-            else ()
-        ):
-            if pulls is not None:
-                self._pulls[at] = pulls
-        half_spaces = frames.pool.map(
-            lambda place: frames.contacts_between(
+        half_spaces = self.frames.pool.map(
+            lambda place: self.frames.contacts_between(
                 self.span[place[0]], place[1], poses[place[0]], poses[(place[0] + 1) % n]
             ),
             places,
@@ -680,9 +692,7 @@ class SpanProgram:
             else:
                 between.append(place[0])
                 self._between.setdefault(place, []).append(contacts)
-        n_apart = sum(pulls.n_apart for pulls in self._pulls.values())
-        lack = sum(pulls.lack for pulls in self._pulls.values())
-        return _Evaluation(corrections, is_free, between, n_apart, lack)
+        return between
 
     def _meet(
         self, at: int, goal: FloatArray, known: Mapping[int, FloatArray], resolves: bool

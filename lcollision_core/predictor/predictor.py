@@ -17,7 +17,7 @@ from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.json_values import from_json, quoted
 from lcollision_core.labels.labeller import LabelRows, StoreIdentity
-from lcollision_core.meshes.topology import FloatArray, array_of
+from lcollision_core.meshes.topology import FloatArray, latent_array
 from lcollision_core.model_file import Section
 from lcollision_core.predictor.compiled_network import CompiledNetwork
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
@@ -370,7 +370,7 @@ class CollisionPredictor:
         return deepcopy(self._network).double()
 
     def _checked(self, latent: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        codes = array_of(latent, "latent")
+        codes = latent_array(latent)
         if codes.ndim != 2 or codes.shape[1] != self.embedding.latent_size:
             raise ShapeError.must_be(
                 "latent", f"of shape (B, {self.embedding.latent_size})", codes.shape
