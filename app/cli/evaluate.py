@@ -132,8 +132,8 @@ def evaluate(
         with cancellable_bar("Judging kinds of poses") as job:
             kinds = score_kinds(model, n_of_kind, job=job, threshold=threshold)
     if keep:
-        measured_by = replace(trained, metrics=metrics, kinds=kinds or trained.kinds)
-        change_body(model, model_name, lambda kept: _with_figures(kept, model, measured_by))
+        measured_predictor = replace(trained, metrics=metrics, kinds=kinds or trained.kinds)
+        change_body(model, model_name, lambda kept: _with_figures(kept, model, measured_predictor))
     if figure is not None:
         from app.view.figures import save_figures
 
@@ -278,19 +278,19 @@ def _samples(
 
 
 def _with_figures(
-    held: LearnedBody, model: LearnedBody, measured_by: CollisionPredictor
+    stored: LearnedBody, model: LearnedBody, measured: CollisionPredictor
 ) -> LearnedBody:
     """Return the model as its file now holds it, with the figures of its predictor."""
     import numpy as np
 
-    now = held.require_predictor().arrays
-    is_same = held.fingerprint == model.fingerprint and now.keys() == measured_by.arrays.keys()
+    now = stored.require_predictor().arrays
+    is_same = stored.fingerprint == model.fingerprint and now.keys() == measured.arrays.keys()
     if not is_same or any(
-        not np.array_equal(now[name], array) for name, array in measured_by.arrays.items()
+        not np.array_equal(now[name], array) for name, array in measured.arrays.items()
     ):
         what = "has another predictor than the one that was measured"
-        raise ModelFileError(what, "evaluate it again", where=held.name)
-    return held.with_predictor(measured_by)
+        raise ModelFileError(what, "evaluate it again", where=stored.name)
+    return stored.with_predictor(measured)
 
 
 def kind_lines(kinds: Sequence[KindScores]) -> list[str]:

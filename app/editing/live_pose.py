@@ -664,7 +664,7 @@ class PoseMotion(QObject):
             self.resting, self.nearest, self.is_measured = None, answer, True
             self.nearest_changed.emit()
         else:
-            self.resting, self.exact = answer, answer.found
+            self.resting, self.exact = answer, answer.collisions
             self.exact_changed.emit()
 
     def _show(self, frame: PoseFrame) -> None:
@@ -675,16 +675,16 @@ class PoseMotion(QObject):
         is_of_pose = frame.latent is self._history.latent
         if is_of_pose:
             self.resting = frame
-        is_found = is_of_pose and frame.found is not None
-        if is_found:
-            self._set_exact(frame.found)
+        is_checked = is_of_pose and frame.collisions is not None
+        if is_checked:
+            self._set_exact(frame.collisions)
         self.frame_changed.emit()
-        if is_found:
+        if is_checked:
             self.exact_changed.emit()
 
-    def _set_exact(self, found: SelfCollisions | None) -> None:
+    def _set_exact(self, collisions: SelfCollisions | None) -> None:
         """Set the exact check of another pose, which is not measured yet."""
-        self.exact, self.nearest, self.is_measured = found, None, False
+        self.exact, self.nearest, self.is_measured = collisions, None, False
 
     def show(self, frame: PoseFrame, state: DocumentState) -> None:
         """Apply a state whose frame is already computed, such as one of a motion."""
@@ -704,7 +704,7 @@ class PoseMotion(QObject):
         """Draw and check a frame that is not the pose's, until the pose changes or `show_own`."""
         self.frame = self.resting = frame
         self.shows_another = True
-        self._set_exact(frame.found)
+        self._set_exact(frame.collisions)
         self.frame_changed.emit()
         self.exact_changed.emit()
         self._rested.start()
@@ -726,7 +726,7 @@ class PoseMotion(QObject):
     def _take(self, frame: PoseFrame, state: DocumentState) -> None:
         self.frame = self.resting = frame
         self.shows_another = False
-        self._set_exact(frame.found)
+        self._set_exact(frame.collisions)
         self._adopted = frame.latent
         self._history.apply(state)
         self._adopted = None

@@ -122,20 +122,20 @@ class MotionResolve(QObject):
         """Whether the Resolve was asked to stop: see `keep_done`."""
         return self._stop.cancelled
 
-    def summary(self, found: ResolvedMotion, part_names: Sequence[str]) -> str:
+    def summary(self, resolved: ResolvedMotion, part_names: Sequence[str]) -> str:
         """Summarise a result in one sentence."""
-        if self.is_ending and not found.spans:
+        if self.is_ending and not resolved.spans:
             return "Stopped before a span of frames was resolved: the motion is as it was"
-        if not found.spans and not found.kept:
+        if not resolved.spans and not resolved.kept:
             return "No frame collides"
-        n_left = int((~found.after).sum())
-        before = counted(int((~found.before).sum()), "frame", "frames")
+        n_left = int((~resolved.after).sum())
+        before = counted(int((~resolved.before).sum()), "frame", "frames")
         text = say("{frames} collided", frames=before)
         if self.is_ending:
             text = say("Stopped: {frames} collided", frames=before)
         now = say_number(n_left, "{n} still does", "{n} still do") if n_left else "all are free now"
-        kept_sentences = (span.sentence(part_names) for span in found.kept)
-        ground = ground_text(None if found.ground is None else asdict(found.ground))
+        kept_sentences = (span.sentence(part_names) for span in resolved.kept)
+        ground = ground_text(None if resolved.ground is None else asdict(resolved.ground))
         return joined((text, now, *kept_sentences, ground))
 
     @Slot(object, int, int)

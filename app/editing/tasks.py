@@ -595,8 +595,8 @@ class Tasks(QObject):
                 sentences.append(say("{n} colliding, though free before", n=n))
         self.message.emit("; ".join(sentences))
 
-    def _on_resolved(self, found: tuple[ResolveResult, npt.NDArray[np.float32]]) -> None:
-        result, ghost = found
+    def _on_resolved(self, solution: tuple[ResolveResult, npt.NDArray[np.float32]]) -> None:
+        result, ghost = solution
         history, seconds = self._history, time.monotonic() - self._solve_began
         history.close_gesture()
         outcome: dict[str, Any] = {"outcome": result, "outcome_seconds": seconds}
@@ -631,8 +631,8 @@ class Tasks(QObject):
                 label, job = "Looking for pairs in contact", partial(changing.offered_rules, model)
                 self.start(Work.PROPOSE_RULES, label, job, self._on_rules_proposed)
 
-    def _on_rules_proposed(self, found: tuple[ProposedRules | None, bool]) -> None:
-        self.proposed_rules, self.offers_rules = found
+    def _on_rules_proposed(self, answer: tuple[ProposedRules | None, bool]) -> None:
+        self.proposed_rules, self.offers_rules = answer
         self.rules_proposed.emit()
 
     def decline_offer(self) -> None:

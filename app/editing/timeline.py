@@ -840,7 +840,7 @@ class Timeline(QObject):
             return []
         return [why for span, why in kept.items() if frame is None or frame in span]
 
-    def _on_resolved(self, asked: Motion, found: ResolvedMotion) -> None:
+    def _on_resolved(self, asked: Motion, resolved: ResolvedMotion) -> None:
         history = self._history
         state = history.state
         if state.moment is None or state.motion is not asked:
@@ -848,19 +848,19 @@ class Timeline(QObject):
             return
         # Worded now: another model may be open while its motion is still read.
         names = history.model.domain_names
-        whys = {span: with_capital(span.sentence(names)) for span in found.kept}
-        self._kept = found.motion if found.spans else asked, whys
-        if found.spans:
+        whys = {span: with_capital(span.sentence(names)) for span in resolved.kept}
+        self._kept = resolved.motion if resolved.spans else asked, whys
+        if resolved.spans:
             frame = state.moment.frame
-            moment = Moment(found.motion, frame)
-            pose = replace(state.pose, latent=found.motion.codes[frame])
+            moment = Moment(resolved.motion, frame)
+            pose = replace(state.pose, latent=resolved.motion.codes[frame])
             after = replace(state, pose=pose, moment=moment, outcome=None, ghost=None)
             history.push("Resolve motion", after)
             # Resolve has checked these frames exactly.
-            self.checks.deepest[found.after & np.isnan(self.checks.deepest)] = 0.0
+            self.checks.deepest[resolved.after & np.isnan(self.checks.deepest)] = 0.0
             self.checked.emit()
         self.resolving.changed.emit()
-        self.message.emit(self.resolving.summary(found, history.model.domain_names))
+        self.message.emit(self.resolving.summary(resolved, history.model.domain_names))
 
     def close(self, deadline: float) -> bool:
         """Stop all work and end the threads; see `LongWork.close`."""

@@ -69,7 +69,7 @@ class PoseFrame:
     vertices : (V, 3) float32 array, read-only, in the data's unit, aligned to the reference
     normals : (V, 3) float32 array, read-only, of length 1, area-weighted
     prediction : None without a prediction
-    found : the exact check of the vertices; None until they are checked
+    collisions : the exact check of the vertices; None until they are checked
     seconds : thread time of the computation
     contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact keeps
         the pose from approaching its target
@@ -83,7 +83,7 @@ class PoseFrame:
     vertices: Float32Array
     normals: Float32Array
     prediction: PosePrediction | None
-    found: SelfCollisions | None
+    collisions: SelfCollisions | None
     seconds: float
     contacts: FloatArray = field(default_factory=empty_points)
     standing: FloatArray = field(default_factory=empty_points)
@@ -94,7 +94,7 @@ class PoseFrame:
     @property
     def is_checked(self) -> bool:
         """Whether all colliding pairs are known, including those that contact rules leave out."""
-        return self.found is not None and not self.found.counted_only
+        return self.collisions is not None and not self.collisions.counted_only
 
 
 class FrameEvaluator:
@@ -134,7 +134,7 @@ class FrameEvaluator:
         is_quick = (
             checks and self._checks and statistics.median(self._checks) < _QUICK_CHECK_SECONDS
         )
-        collisions = self._found(vertices) if is_quick else None
+        collisions = self._detect(vertices) if is_quick else None
         return self._drawn(latent, vertices, collisions, start)
 
     def moved(self, dragger: PoseDragger, target: FloatArray) -> PoseFrame:
@@ -161,7 +161,7 @@ class FrameEvaluator:
 
     def checked(self, frame: PoseFrame) -> PoseFrame:
         """Check the vertices of a frame exactly."""
-        return replace(frame, found=self._found(frame.vertices))
+        return replace(frame, collisions=self._detect(frame.vertices))
 
     def nearest(self, frame: PoseFrame) -> NearestPair | None:
         """Find the nearest pair of a frame's surface; None if none is nearer than the bound."""
@@ -173,7 +173,7 @@ class FrameEvaluator:
         self,
         latent: FloatArray,
         vertices: Float32Array,
-        found: SelfCollisions | None,
+        collisions: SelfCollisions | None,
         start: float,
         **moved: Any,
     ) -> PoseFrame:
@@ -183,7 +183,7 @@ class FrameEvaluator:
             _frozen(vertices),
             _frozen(self.normals(vertices)),
             self._predict(latent) if predicts else None,
-            found,
+            collisions,
             time.thread_time() - start,
             **moved,
         )
@@ -195,7 +195,7 @@ class FrameEvaluator:
             collision_probability=float(predicted.collision_probability[0]),
         )
 
-    def _found(self, vertices: Float32Array) -> SelfCollisions:
+    def _detect(self, vertices: Float32Array) -> SelfCollisions:
         start = time.thread_time()
         collisions = self.model.detector.detect(vertices)
         self._checks.append(time.thread_time() - start)
@@ -519,8 +519,8 @@ class FrameCache(QObject):
 
 def _key(motion: Motion, number: int) -> _Key:
     # If all frames share one body, equal codes give equal frames.
-    frame_space = motion.space_at
-    return motion.codes[number].tobytes(), frame_space, 0 if frame_space is None else number
+    space_at = motion.space_at
+    return motion.codes[number].tobytes(), space_at, 0 if space_at is None else number
 
 
 def _bytes_of(frame: PoseFrame) -> int:

@@ -625,13 +625,13 @@ class Body(ABC):
         PoseSetError : the number of vertices or faces, or the faces themselves, differ.
         """
         needed = self.topology
-        for noun, found, count in (
+        for noun, given, expected in (
             ("vertices", topology.n_vertices, needed.n_vertices),
             ("faces", topology.n_faces, needed.n_faces),
         ):
-            if found != count:
+            if given != expected:
                 raise PoseSetError(
-                    f"has {found} {noun}, the model {self.name!r} has {count}",
+                    f"has {given} {noun}, the model {self.name!r} has {expected}",
                     "export it with the model's topology",
                     where=source,
                 )

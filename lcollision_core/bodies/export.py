@@ -687,9 +687,9 @@ def write_sequence(
     """
     files = sequence_files(path, body, source)
     if Path(path).suffix.lower() in SKELETON_SUFFIXES:
-        shown_vertices, notes = write_skeleton(path, body, latents, vertices, request.fps)
+        stored_vertices, notes = write_skeleton(path, body, latents, vertices, request.fps)
         return list(files), _Frames(
-            len(latents), lambda frame: WrittenPose(Path(path), shown_vertices(frame), 1.0, notes)
+            len(latents), lambda frame: WrittenPose(Path(path), stored_vertices(frame), 1.0, notes)
         )
     if source is not None and source.require_form(path, None).suffix == ".glb":
         file_frame = source.frame or export_frame(body, request.axes, path)

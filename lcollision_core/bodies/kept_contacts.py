@@ -221,10 +221,10 @@ class _Samples:
             edges = np.flatnonzero(np.maximum(n_steps, 1) == n)
             a, b = (grid.ravel() for grid in np.meshgrid(np.arange(n), np.arange(n)))
             inside = a + b < n
-            one = (np.column_stack([a, b])[inside] + 1.0 / 3.0) / n
-            one = np.column_stack([1.0 - one.sum(axis=1), one])
-            owners.append(np.repeat(edges, len(one)))
-            shares.append(np.tile(one, (len(edges), 1)))
+            last_two = (np.column_stack([a, b])[inside] + 1.0 / 3.0) / n
+            barycentric = np.column_stack([1.0 - last_two.sum(axis=1), last_two])
+            owners.append(np.repeat(edges, len(barycentric)))
+            shares.append(np.tile(barycentric, (len(edges), 1)))
         face, weights = np.concatenate(owners), np.concatenate(shares)
         part = space.vertex_domain[faces[face, weights.argmax(axis=1)]]
         cells = np.floor(_at(rest, faces, face, weights) / _SPACING).astype(np.int64)

@@ -345,14 +345,14 @@ def _contacts(
     """Return a function that finds a retargeted motion's contacts, or None without a skin."""
 
     @cache
-    def found() -> KeptContacts | None:
+    def contacts() -> KeptContacts | None:
         source = _source_of(path)
         if source is None:
             return None
         source_motion = _of_clip(source.character, source.space, motion.name, fps)
         return contacts_of(body, motion, source, source_motion, retargeting)
 
-    return found
+    return contacts
 
 
 def _source_of(path: Path) -> RigBody | None:
@@ -377,7 +377,7 @@ def _with_weights(body: Body, path: Path, motion: Motion, fps: float | None) -> 
     clip, codes = _of_clip(source.character, source.space, motion.name, fps), motion.codes.copy()
     for name in names:
         own, theirs = (
-            one.shape_codes.start + one.shape_names.index(name) for one in (body, source)
+            shaped.shape_codes.start + shaped.shape_names.index(name) for shaped in (body, source)
         )
         since = clip.times - clip.times[0]
         codes[:, own] = np.interp(motion.times, since, clip.codes[:, theirs])

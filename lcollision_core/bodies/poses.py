@@ -324,10 +324,10 @@ def _other_model(
         str(owner.get(key))[:MAX_POSE_NAME_LENGTH] for key in ("fingerprint", "name")
     )
     listed, character = find_latent_space(fingerprint, name), find_character(fingerprint)
-    other_name = listed or character
-    if other_name is not None and other_name.name == model.name:
-        what = f"contains poses of another {name!r}, {other_name.path}: {_difference(owner, model)}"
-        next_step = f"use them with {other_name.path}"
+    other = listed or character
+    if other is not None and owner_model.name == model.name:
+        what = f"contains poses of another {name!r}, {other.path}: {_difference(owner, model)}"
+        next_step = f"use them with {other.path}"
     elif listed is not None:
         what = f"contains poses of the model {listed.name!r}, not of {model.name!r}"
         next_step = f"use them with {listed.name!r}"
@@ -352,7 +352,7 @@ def _other_model(
             "among your models"
         )
         next_step = f"copy its file to {user_models_folder()}, or name it"
-    return OtherModelError(what, next_step, where=path, model=other_name)
+    return OtherModelError(what, next_step, where=path, model=other)
 
 
 def _measures(model: Body) -> dict[str, int]:

@@ -786,18 +786,18 @@ def write_skeleton(
     write_bytes(path, data)
     if is_bvh:
         # Any rig can read back its own BVH file; retargeting might not match it.
-        latents_in_file = transforms_from_bvh(body.space, read_bvh(path))
+        stored_transforms = transforms_from_bvh(body.space, read_bvh(path))
     else:
         ((back, _),) = retargeted_motions(body, Path(path), fps=fps)
         codes = back.codes
-        latents_in_file = np.array([body.space.transforms(row) for row in codes])
+        stored_transforms = np.array([body.space.transforms(row) for row in codes])
     space, size = body.space, body.body_size
 
     def stored(frame: int) -> npt.NDArray[Any]:
-        return (space.skinned(latents_in_file[frame]) * size).astype(np.float32)
+        return (space.skinned(stored_transforms[frame]) * size).astype(np.float32)
 
     # Lazily: all frames at once may not fit in memory.
-    pairs = zip(range(len(latents_in_file)), vertices, strict=True)
+    pairs = zip(range(len(stored_transforms)), vertices, strict=True)
     off = max(float(np.abs(stored(frame) - shown).max()) for frame, shown in pairs) / size
     notes: tuple[str, ...] = ()
     if off > _SAME:

@@ -115,7 +115,7 @@ def fit_rig(
     starts = [space.codes_of_transforms(_turned_joints(space, aligned)), np.zeros_like(space.low)]
     missing = [aligned[sample] - space.decode(codes[None])[0, sample] for codes in starts]
     codes, missing_now = min(
-        zip(starts, missing, strict=True), key=lambda one: float((one[1] ** 2).sum())
+        zip(starts, missing, strict=True), key=lambda start: float((start[1] ** 2).sum())
     )
     damping = _DAMPING
     for _ in range(_FIT_STEPS):
@@ -516,7 +516,7 @@ class RigBody(Body):
                 frames.append(clip_frames.transforms)
                 shapes += [] if clip_frames.shapes is None else [clip_frames.shapes]
         transforms, numbers = (
-            np.concatenate(one)[:_MOST_FRAMES] if one else None for one in (frames, shapes)
+            np.concatenate(rows)[:_MOST_FRAMES] if rows else None for rows in (frames, shapes)
         )
         space = RigPoseSpace(character, parts, transforms, numbers)
         poses = np.concatenate([np.zeros((1, len(space.low))), space.frame_codes])

@@ -308,13 +308,13 @@ class RigPoseSpace:
     @property
     def domains_of_shapes(self) -> list[int]:
         """The body part that each of the S shapes moves most."""
-        shapes, found = self.rig.shapes, []
+        shapes, domains = self.rig.shapes, []
         owner = np.repeat(self.vertex_domain, np.diff(self._first))
         for column in range(self.n_shapes):
             assert shapes is not None
             moved = np.linalg.norm(shapes.offsets(np.eye(1, self.n_shapes, column)[0]), axis=1)
-            found.append(int(np.bincount(owner, self._weights * moved).argmax()))
-        return found
+            domains.append(int(np.bincount(owner, self._weights * moved).argmax()))
+        return domains
 
     @property
     def n_domains(self) -> int:

@@ -247,14 +247,14 @@ class SceneBody(Body):
     def plays(self) -> dict[str, tuple[str, float]]:
         """Clip and start time, by name, of each moving body that has clips."""
         parts = () if self.file is None else self.file.bodies
-        found = {}
+        clip_of = {}
         for member, part in zip_longest(self.members, parts[: len(self.members)]):
             clips = member.body.own_clips
             if member.moves and clips and member.body.own_file is not None:
                 chosen = part is not None and part.clip in clips
                 start = 0.0 if part is None else part.start
-                found[member.name] = (part.clip if chosen else clips[0], start)
-        return found
+                clip_of[member.name] = (part.clip if chosen else clips[0], start)
+        return clip_of
 
     def _placed(self, member: SceneMember) -> PlacedSpace:
         """Return the space of a member and its held bodies."""
@@ -740,8 +740,8 @@ class SceneBody(Body):
         latent = target.copy()
         options = ResolveOptions(clearance=check.clearance)
         for body in self._alone.values():
-            found = body.resolver.resolve(target[body.codes], body.options(options))
-            latent[body.codes] = found.latent
+            resolved = body.resolver.resolve(target[body.codes], body.options(options))
+            latent[body.codes] = resolved.latent
         near = self.least_separated(latent, check)
         if len(near):
             return near

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
+from operator import itemgetter
 
 import numpy as np
 
@@ -141,7 +142,7 @@ class Skeleton:
         ]
         if not candidates:
             return None
-        _, legs, arms = max(candidates, key=lambda one: one[0])
+        _, legs, arms = max(candidates, key=itemgetter(0))
         roles: dict[int, Role] = {}
         hinges = []
         for pair, end in ((legs, Role.FOOT), (arms, Role.HAND)):
@@ -191,7 +192,7 @@ class Skeleton:
             ):
                 neck = max(float(self._tips[joint] @ self._up) for joint in self.below(fore.trunk))
                 fronts.append((neck, _unit(trunk - (trunk @ self._up) * self._up)))
-        return max(fronts, key=lambda one: one[0])[1] if fronts else None
+        return max(fronts, key=itemgetter(0))[1] if fronts else None
 
     def _distance(self, a: int, b: int) -> float:
         return float(np.linalg.norm(self._places[a] - self._places[b]))
@@ -295,7 +296,9 @@ class Skeleton:
             top = (self._places[list(self.below(child))] @ up).max()
             rises = top > self._places[arms.trunk] @ up
             if child not in arm_roots and not aside and rises:
-                best = max(best, self._chain(child), key=lambda one: self._shares[one[:1]].sum())
+                best = max(
+                    best, self._chain(child), key=lambda chain: self._shares[chain[:1]].sum()
+                )
         return best
 
     def _hinge(self, chain: list[int], end: Role) -> tuple[int, int, int]:

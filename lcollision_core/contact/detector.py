@@ -310,11 +310,11 @@ class CollisionDetector:
         Parameters and errors are those of the class.
         """
         before = self.rules
-        lengths, held_lengths = (
+        lengths, lengths_before = (
             (version.near_exclusion, version.near_by_limb, version.rest_exclusion)
             for version in (rules, before)
         )
-        if lengths != held_lengths or (
+        if lengths != lengths_before or (
             rules.near_by_limb and not _same_joints(groups, self.groups)
         ):
             other = CollisionDetector(self.topology, self.reference, rules, groups, self.body_size)

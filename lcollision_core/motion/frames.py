@@ -111,9 +111,9 @@ class Frames:
         problem = self.problem(frame)
         return problem.low, problem.high
 
-    def distance(self, one: FloatArray, other: FloatArray) -> float:
+    def distance(self, pose_a: FloatArray, pose_b: FloatArray) -> float:
         """Return the distance of two (D,) poses, the root of the metric's squared distance."""
-        moved = one - other
+        moved = pose_a - pose_b
         return math.sqrt(max(float(moved @ self.metric @ moved), 0.0))
 
     def is_free(self, frame: int, codes: FloatArray) -> bool:
@@ -478,16 +478,16 @@ class ScreenedMotion:
 
 
 def colliding_domains(
-    found: SelfCollisions, vertex_domain: npt.NDArray[np.intp], faces: npt.NDArray[np.int32]
+    collisions: SelfCollisions, vertex_domain: npt.NDArray[np.intp], faces: npt.NDArray[np.int32]
 ) -> tuple[tuple[int, int], ...]:
     """Return pairs of colliding domains, the lower index first, those with most pairs first.
 
     Parameters
     ----------
-    found : collisions of the mesh
+    collisions : collisions of the mesh
     vertex_domain, faces : see `screen_frames`
     """
-    owners = np.sort(vertex_domain[faces[found.pairs][:, :, 0]], axis=1)
+    owners = np.sort(vertex_domain[faces[collisions.pairs][:, :, 0]], axis=1)
     n_domains = int(vertex_domain.max()) + 1
     domains, counts = np.unique(owners @ [n_domains, 1], return_counts=True)
     ordered = domains[np.argsort(-counts, kind="stable")].tolist()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 import numpy.typing as npt
@@ -57,29 +58,27 @@ class GroundReport:
         level = np.eye(3) - np.outer(axis, axis)
         worst = dict.fromkeys(("sink", "gap", "slide"), (0.0, 0))
         # For each standing part, the vertices of its sole and where their mean was at first.
-        standing_vertices: dict[int, tuple[npt.NDArray[np.intp], FloatArray]] = {}
+        soles: dict[int, tuple[npt.NDArray[np.intp], FloatArray]] = {}
         n_standing = 0
         for frame, vertices in enumerate(placed_frames(motion, check)):
             heights = vertices @ axis - ground
-            worst_values = [("sink", -float(heights[stands].min()))]
+            measures = [("sink", -float(heights[stands].min()))]
             parts = np.flatnonzero(standing[frame]).tolist()
             vertices_of_part = {part: np.flatnonzero(domain == part) for part in parts}
             vertices_of_part = {part: rows for part, rows in vertices_of_part.items() if len(rows)}
             n_standing += bool(vertices_of_part)
-            standing_vertices = {
-                part: place for part, place in standing_vertices.items() if part in vertices_of_part
-            }
+            soles = {part: place for part, place in soles.items() if part in vertices_of_part}
             for part, rows in vertices_of_part.items():
                 lowest = float(heights[rows].min())
-                worst_values.append(("gap", lowest))
-                if part not in standing_vertices:
+                measures.append(("gap", lowest))
+                if part not in soles:
                     sole = rows[heights[rows] <= max(lowest, 0.0) + _SOLE]
-                    standing_vertices[part] = sole, level @ vertices[sole].mean(axis=0)
-                sole, place = standing_vertices[part]
+                    soles[part] = sole, level @ vertices[sole].mean(axis=0)
+                sole, place = soles[part]
                 moved = level @ vertices[sole].mean(axis=0) - place
-                worst_values.append(("slide", float(np.linalg.norm(moved))))
-            for name, value in worst_values:
-                worst[name] = max(worst[name], (value, frame), key=lambda one: one[0])
+                measures.append(("slide", float(np.linalg.norm(moved))))
+            for name, value in measures:
+                worst[name] = max(worst[name], (value, frame), key=itemgetter(0))
         depths = {name: value for name, (value, _) in worst.items()}
         frames = {f"{name}_frame": frame for name, (_, frame) in worst.items()}
         return cls(n_standing, **depths, **frames)  # type: ignore[arg-type]

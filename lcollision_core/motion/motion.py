@@ -105,26 +105,26 @@ class Motion:
 
     def two_turns(self) -> Motion:
         """Return two turns of a cycle, without the frame that repeats the first."""
-        n, frame_space, hidden = len(self) - 1, self.space_at, self.hidden
+        n, space_at, hidden = len(self) - 1, self.space_at, self.hidden
         turn = self.times[:-1]
         return replace(
             self,
             times=np.concatenate([turn, turn + (self.times[-1] - self.times[0])]),
             codes=np.tile(self.codes[:-1], (2, 1)),
             placements=None if self.placements is None else self.placements[:-1] * 2,
-            space_at=None if frame_space is None else lambda time: frame_space(time % n),
+            space_at=None if space_at is None else lambda time: space_at(time % n),
             hidden=None if hidden is None else lambda frame: hidden(frame % n),
             contacts=self._contacts_at([*range(n)] * 2),
         )
 
     def _contacts_at(self, frames: Sequence[int]) -> Callable[[], KeptContacts | None] | None:
         """Return the `contacts` of a motion of some of the frames."""
-        contacts_at = self.contacts
-        if contacts_at is None:
+        find = self.contacts
+        if find is None:
             return None
 
         def chosen() -> KeptContacts | None:
-            contacts = contacts_at()
+            contacts = find()
             return None if contacts is None else contacts.at(frames)
 
         return chosen
@@ -139,14 +139,14 @@ class Motion:
 
     def part(self, frames: range) -> Motion:
         """Return the motion of some successive frames, at their times."""
-        frame_space, hidden = self.space_at, self.hidden
+        space_at, hidden = self.space_at, self.hidden
         rows = slice(frames.start, frames.stop)
         return replace(
             self,
             times=self.times[rows],
             codes=np.array(self.codes[rows]),
             placements=None if self.placements is None else self.placements[rows],
-            space_at=None if frame_space is None else lambda time: frame_space(time + frames.start),
+            space_at=None if space_at is None else lambda time: space_at(time + frames.start),
             hidden=None if hidden is None else lambda frame: hidden(frame + frames.start),
             contacts=self._contacts_at(frames),
         )
@@ -162,7 +162,7 @@ class Motion:
         if len(self) == n and np.allclose(times, self.times, rtol=0.0, atol=1e-6):
             return self
         nearest = np.searchsorted(0.5 * (self.times[1:] + self.times[:-1]), times)
-        frame_space, placements, hidden = self.space_at, self.placements, self.hidden
+        space_at, placements, hidden = self.space_at, self.placements, self.hidden
         codes, at = np.array(self.codes[nearest]), nearest.astype(np.float64)
         if placements is None:
             codes = np.array([np.interp(times, self.times, row) for row in self.codes.T]).T
@@ -173,8 +173,8 @@ class Motion:
             codes=codes,
             placements=None if placements is None else tuple(placements[at] for at in nearest),
             space_at=None
-            if frame_space is None
-            else lambda time: frame_space(float(np.interp(time, np.arange(n), at))),
+            if space_at is None
+            else lambda time: space_at(float(np.interp(time, np.arange(n), at))),
             hidden=None if hidden is None else lambda frame: hidden(int(nearest[frame])),
             contacts=self._contacts_at(nearest.tolist()),
         )

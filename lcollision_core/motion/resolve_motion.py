@@ -858,7 +858,7 @@ class _Resolution:
             for side in (is_left & is_moved, is_left & ~is_moved)
             for run in colliding_spans(side, 0, None, self.is_cycle)
         ]
-        return tuple(sorted(filter(None, spans), key=lambda one: one.frames))
+        return tuple(sorted(filter(None, spans), key=lambda span: span.frames))
 
 
 class _Solution(NamedTuple):

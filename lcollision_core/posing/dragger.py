@@ -499,7 +499,7 @@ class DragStep:
     latent : (D,) float64 array, read-only
     vertices : (V, 3) float32 array, read-only, in the data's unit, in model coordinates
     miss : distance left to the target: normalised length, or radians for a twist
-    found : the exact check of these vertices as exported, without excluded pairs, with the
+    collisions : the exact check of these vertices as exported, without excluded pairs, with the
         clearance of the drag; None if the drag is not solid
     crossing : the same without the clearance: pairs that penetrate
     contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact stops
@@ -511,7 +511,7 @@ class DragStep:
     latent: FloatArray
     vertices: npt.NDArray[np.float32]
     miss: float
-    found: SelfCollisions | None
+    collisions: SelfCollisions | None
     crossing: SelfCollisions | None
     contacts: FloatArray
     standing: FloatArray
@@ -520,7 +520,7 @@ class DragStep:
     @property
     def exactly_free(self) -> bool | None:
         """Whether the pose is free of collisions; None if it was not checked."""
-        return None if self.found is None else not self.found.colliding
+        return None if self.collisions is None else not self.collisions.colliding
 
 
 class PoseDragger:
@@ -587,11 +587,11 @@ class PoseDragger:
         self._helps_at = _SHORT, _SHORT
         self._has_forgotten, self._blocking = False, np.empty(0, dtype=np.int64)
         self._here = Decoded(start, check.decode(start)[0])
-        self._found: SelfCollisions | None = None
+        self._collisions: SelfCollisions | None = None
         self._allowed: dict[int, tuple[float, float]] = {}
         if self._options.solid:
-            self._found = check.find(check.exported(self._here.vertices))
-            self._allowed = ContactRegions.of(space, self._found).by_name()
+            self._collisions = check.find(check.exported(self._here.vertices))
+            self._allowed = ContactRegions.of(space, self._collisions).by_name()
         self._stands: list[HeldPatch] = []
         self._goal = CodesGoal(space) if grip is None else self._take(grip, pins)
         self._stretch = self._stretch_of(self._here.vertices)
@@ -804,7 +804,7 @@ class PoseDragger:
                 may_keep = {name: depth for name, (depth, _) in self._allowed.items()}
                 self._contacts.separate(there, decoded, collisions, regions, may_keep)
                 return False
-            self._found = collisions
+            self._collisions = collisions
             self._allowed = {
                 name: (min(depth, allowed[name][0]), min(squared, allowed[name][1]))
                 for name, (depth, squared) in depths.items()
@@ -826,7 +826,7 @@ class PoseDragger:
         vertices = self._check.drawn(self._here.vertices)
         latent = self._here.codes.copy()
         latent.flags.writeable = vertices.flags.writeable = False
-        crossing = self._found
+        crossing = self._collisions
         if crossing is not None and crossing.colliding and self._check.clearance > 0.0:
             crossing = self._plain.find(self._plain.exported(self._here.vertices))
         touching = np.unique(self._contacts.touching(latent))
@@ -837,7 +837,7 @@ class PoseDragger:
             latent=latent,
             vertices=vertices,
             miss=miss,
-            found=self._found,
+            collisions=self._collisions,
             crossing=crossing,
             contacts=vertices[touching].astype(np.float64),
             standing=np.array([stand.place for stand in self._stands]).reshape(-1, 3)

@@ -227,7 +227,7 @@ class ExactCheck:
             self._seeing.least_distance(form, bound, unit=self._unit)
             for form in in_each_format(exported, self.detector.topology)
         )
-        return min(filter(None, nearest_pairs), key=lambda one: one.distance, default=None)
+        return min(filter(None, nearest_pairs), key=lambda pair: pair.distance, default=None)
 
     @property
     def _unit(self) -> float:
@@ -310,12 +310,12 @@ class ContactRegions:
     squared_depth: FloatArray
 
     @classmethod
-    def of(cls, space: PoseSpace, found: SelfCollisions) -> ContactRegions:
+    def of(cls, space: PoseSpace, collisions: SelfCollisions) -> ContactRegions:
         """Group the pairs of a pose."""
-        owner = space.vertex_domain[space.topology.faces[found.pairs][:, :, 0]]
+        owner = space.vertex_domain[space.topology.faces[collisions.pairs][:, :, 0]]
         keys = np.sort(owner, axis=1) @ np.array([space.n_domains, 1])
         names, of_pair = np.unique(keys, return_inverse=True)
-        depths = found.penetration_depth
+        depths = collisions.penetration_depth
         squared: FloatArray = np.bincount(of_pair, depths**2, minlength=len(names)).astype(
             np.float64
         )
@@ -332,7 +332,7 @@ def contact_slopes(
     space: PoseSpace,
     codes: FloatArray,
     decoded: FloatArray,
-    found: SelfCollisions,
+    collisions: SelfCollisions,
     regions: ContactRegions,
     *,
     has_clearance: bool = False,
@@ -346,8 +346,8 @@ def contact_slopes(
     ----------
     codes : (D,) float64 array
     decoded : (V, 3) float64 array, the pose's vertices in normalised length
-    found : the pose's colliding pairs, at least one
-    regions : of `found`
+    collisions : the pose's colliding pairs, at least one
+    regions : of `collisions`
     has_clearance : whether pairs were found with a clearance, so that some do not penetrate
 
     Returns
@@ -359,14 +359,14 @@ def contact_slopes(
     -----
     A pair's depth is at most the size of its triangles, so this resolves only shallow contact.
     """
-    share = found.penetration_depth**2 / regions.squared_depth[regions.of_pair]
+    share = collisions.penetration_depth**2 / regions.squared_depth[regions.of_pair]
     deepest = np.argsort(-regions.depth, kind="stable")[:MAX_REGIONS]
     row = np.full(len(regions.names), -1)
     row[deepest] = np.arange(len(deepest))
     of_pair = row[regions.of_pair]
     kept = of_pair >= 0
     by_vertices = np.zeros((len(deepest), *decoded.shape))
-    faces = space.topology.faces[found.pairs[kept]]
+    faces = space.topology.faces[collisions.pairs[kept]]
     add_slopes(by_vertices, of_pair[kept], faces, decoded, share[kept], has_clearance=has_clearance)
     return deepest, space.pull_back(codes, by_vertices)
 
@@ -427,7 +427,7 @@ class Contacts:
         self,
         codes: FloatArray,
         decoded: FloatArray,
-        found: SelfCollisions,
+        collisions: SelfCollisions,
         regions: ContactRegions,
         allowed: Mapping[int, float] | None = None,
     ) -> None:
@@ -435,16 +435,16 @@ class Contacts:
 
         Parameters
         ----------
-        codes, decoded, found, regions : see `contact_slopes`
+        codes, decoded, collisions, regions : see `contact_slopes`
         allowed : normalised depths that regions may keep, by their names
         """
         apart = self._check.clearance > 0.0
         deepest, slopes = contact_slopes(
-            self._check.space, codes, decoded, found, regions, has_clearance=apart
+            self._check.space, codes, decoded, collisions, regions, has_clearance=apart
         )
         tolerated = np.full(len(regions.names), np.inf)
         np.minimum.at(
-            tolerated, regions.of_pair, self._check.detector.tolerated_depths(found.pairs)
+            tolerated, regions.of_pair, self._check.detector.tolerated_depths(collisions.pairs)
         )
         may_keep = np.array(
             [
@@ -453,7 +453,7 @@ class Contacts:
             ]
         )
         first_pair = [int((regions.of_pair == region).argmax()) for region in deepest]
-        corner = self._check.space.topology.faces[found.pairs[first_pair, 0], 0]
+        corner = self._check.space.topology.faces[collisions.pairs[first_pair, 0], 0]
         self.normals = np.concatenate([self.normals, slopes])
         offsets = slopes @ codes - regions.depth[deepest] + may_keep
         self.offsets = np.concatenate([self.offsets, offsets])

@@ -229,7 +229,7 @@ class Ladder:
         return (lifted, None) if least.is_within(lifted) else (latent, say(FEET_MOVED))
 
     def _soften(
-        self, found: FloatArray | None, step: Step, most: float, note: str | None
+        self, free: FloatArray | None, step: Step, most: float, note: str | None
     ) -> tuple[FloatArray, Step, str | None]:
         """Return a free pose that moves no vertex too far, else the one of least overlap.
 
@@ -238,32 +238,32 @@ class Ladder:
         """
         least = self._least
         if self.problem.model is None:
-            if found is None or least.mean_change(found) > FAR:
-                known = found if found is not None and least.is_within(found) else None
+            if free is None or least.mean_change(free) > FAR:
+                known = free if free is not None and least.is_within(free) else None
                 pushed = least.push_out(self._put_back, known)
                 if pushed is not None:
-                    found, step = pushed, Step.PUSH_OUT
-            if found is not None:
+                    free, step = pushed, Step.PUSH_OUT
+            if free is not None:
                 drawn = draw_nearer(
                     self.check,
                     self.problem,
-                    found,
+                    free,
                     self.standing,
                     self.options.still_domains,
                     self.options.seed,
                 )
-                found = least.nearer(found, self._put_back(drawn))
-        if found is not None and least.is_within(found):
-            return found, step, None
-        if found is not None and self._nearer is not None and least.is_within(self._nearer):
+                free = least.nearer(free, self._put_back(drawn))
+        if free is not None and least.is_within(free):
+            return free, step, None
+        if free is not None and self._nearer is not None and least.is_within(self._nearer):
             return self._lifted(self._nearer, least)[0], step, say(FEET_MOVED)
         starts = np.where(self.problem.movable, self.free_latents, self.problem.target)
         nearest = starts[np.argsort(self.problem.distance(starts), kind="stable")]
-        latent = least.find([*([] if found is None else [found]), *nearest])
+        latent = least.find([*([] if free is None else [free]), *nearest])
         latent, sunk = self._lifted(latent, least)
         if self.check.is_free(latent):
             return latent, Step.SOFT, sunk
-        if found is not None:
+        if free is not None:
             note = (
                 say(
                     "no pose with this clearance was found within {most:g} % of the body size",

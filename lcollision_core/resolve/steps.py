@@ -219,11 +219,11 @@ class _Seen:
 
     latent: FloatArray
     decoded: FloatArray
-    found: SelfCollisions
+    collisions: SelfCollisions
 
 
 def _energy(seen: _Seen) -> float:
-    return seen.found.energy
+    return seen.collisions.energy
 
 
 class LeastOverlap:
@@ -271,11 +271,11 @@ class LeastOverlap:
                 for seen in (self._start, self._shallowest, best, *sorted(ways, key=_energy)[:1])
             }
             ends_of = [*map(self._descend, starts.values()), best]
-            better = (end for end in ends_of if not end.found.exceeds(self._start.found))
+            better = (end for end in ends_of if not end.collisions.exceeds(self._start.collisions))
             best = min(better, key=_energy)
-            if not best.found.colliding:
+            if not best.collisions.colliding:
                 break
-        if not best.found.colliding:
+        if not best.collisions.colliding:
             nearer = pull_back(self._check, self._problem, best.latent)
             return nearer if self.is_within(nearer) else best.latent
         return best.latent
@@ -322,9 +322,9 @@ class LeastOverlap:
             best = pushed(start, reach)
         return None if best is known else best
 
-    def nearer(self, one: FloatArray | None, other: FloatArray | None) -> FloatArray | None:
+    def nearer(self, pose_a: FloatArray | None, pose_b: FloatArray | None) -> FloatArray | None:
         """Return which of two (D,) poses moves the vertices less, the first if they tie."""
-        both = [pose for pose in (one, other) if pose is not None]
+        both = [pose for pose in (pose_a, pose_b) if pose is not None]
         return min(both, key=self.mean_change, default=None)
 
     def _pushed(self, here: _Seen, reach: float, known: FloatArray | None) -> FloatArray | None:
@@ -335,7 +335,7 @@ class LeastOverlap:
         check, problem, best = self._check, self._problem, here
         most = np.inf if known is None else _FARTHER * self.mean_change(known)
         for _ in range(_PUSHES):
-            goal = self._goal(here, _GAP) if here.found.colliding else None
+            goal = self._goal(here, _GAP) if here.collisions.colliding else None
             if goal is None or self._looks_left <= 0 or problem.deadline.expired:
                 break
             self._looks_left -= known is not None
@@ -346,7 +346,7 @@ class LeastOverlap:
             if _energy(here) < _energy(best):
                 best = here
         self._shallowest = min(self._shallowest, best, key=_energy)
-        free = polish(check, problem, best.latent) if best.found.colliding else best.latent
+        free = polish(check, problem, best.latent) if best.collisions.colliding else best.latent
         if free is None:
             return None
         nearer = pull_back(check, problem, free)
@@ -392,7 +392,7 @@ class LeastOverlap:
         """Return the last pose of a descent that does not exceed Z*, or else the start."""
         last = here
         for _ in range(_ROUNDS):
-            if not here.found.colliding or self._problem.deadline.expired:
+            if not here.collisions.colliding or self._problem.deadline.expired:
                 break
             goal = self._goal(here)
             if goal is None:
@@ -405,7 +405,7 @@ class LeastOverlap:
             else:
                 break
             here = trial
-            if not here.found.exceeds(self._start.found):
+            if not here.collisions.exceeds(self._start.collisions):
                 last = here
         return last
 
@@ -414,7 +414,7 @@ class LeastOverlap:
 
         Each contact of two body parts is one residual: the root of its energy.
         """
-        space, collisions, problem = self._check.space, here.found, self._problem
+        space, collisions, problem = self._check.space, here.collisions, self._problem
         regions = ContactRegions.of(space, collisions)
         residuals = np.sqrt(regions.squared_depth)
         weights = collisions.penetration_depth / residuals[regions.of_pair]

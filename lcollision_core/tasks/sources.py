@@ -299,8 +299,8 @@ def summarise_sources(paths: Sequence[Path], job: Job = UNWATCHED) -> SourcesSum
         summaries.append(summary or _of_poses(path, job, topology))
         job.check()
     first = next((summary for summary in summaries if summary.n_joints), summaries[0])
-    for path, one in zip(paths, summaries, strict=True):
-        defect = disagreement(path.name, one.topology, first.topology)
+    for path, of_file in zip(paths, summaries, strict=True):
+        defect = disagreement(path.name, of_file.topology, first.topology)
         if defect is not None:
             raise defect
     others = [summary for summary in summaries if summary is not first]

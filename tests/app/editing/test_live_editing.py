@@ -75,7 +75,7 @@ def test_a_drag_moves_the_patch_by_one_step_and_asks_for_no_frame_again(
     frame = solid.motion.frame
     assert frame is not None
     assert frame.latent is solid.history.latent
-    assert frame.found is solid.motion.exact
+    assert frame.collisions is solid.motion.exact
     assert np.linalg.norm(grip.position(frame.vertices) - start) > 0.03 * solid.model.body_size
     solid.motion.end_drag()
     assert not solid.motion.dragging

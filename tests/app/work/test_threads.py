@@ -285,7 +285,7 @@ def test_a_quick_check_comes_with_its_frame_and_a_slow_one_when_the_pose_rests(
             assert document.motion.exact is None
             with qtbot.waitSignal(document.motion.frame_changed):
                 pass
-            assert (document.motion.frame.found is not None) == comes_with_frame
+            assert (document.motion.frame.collisions is not None) == comes_with_frame
             settle(qtbot, document)
             resting = document.motion.resting
             assert resting is None or resting.is_checked

@@ -109,7 +109,7 @@ def test_a_solid_drag_is_free_where_a_plain_one_collides(
             exact = tube_model.detector.detect(step.vertices)
             if solid:
                 assert step.exactly_free is True
-                assert step.found is not None
+                assert step.collisions is not None
                 assert not exact.colliding
             else:
                 assert step.exactly_free is None
@@ -166,15 +166,15 @@ def test_a_colliding_pose_is_not_made_worse(tube_model: LearnedBody, tip: Grip) 
     for latent in sample_poses(tube_model, 6, seed=9, colliding=True):
         step = dragger.begin(latent, tip)
         assert step.exactly_free is False
-        before = step.found
+        before = step.collisions
         start = tip.position(step.vertices)
         for _ in range(20):
             step = dragger.move(start + generator.normal(size=3) * 0.3 * tube_model.body_size)
-            assert step.found is not None
+            assert step.collisions is not None
             assert before is not None
             # Up to rounding, or up to the tolerated depths of a region.
-            assert step.found.energy <= before.energy * (1.0 + 1e-5) or step.exactly_free
-            before = step.found
+            assert step.collisions.energy <= before.energy * (1.0 + 1e-5) or step.exactly_free
+            before = step.collisions
         freed += bool(step.exactly_free)
     assert freed > 0
 
