@@ -325,7 +325,7 @@ def _other_model(
     )
     listed, character = find_latent_space(fingerprint, name), find_character(fingerprint)
     other = listed or character
-    if other is not None and owner_model.name == model.name:
+    if other is not None and other.name == model.name:
         what = f"contains poses of another {name!r}, {other.path}: {_difference(owner, model)}"
         next_step = f"use them with {other.path}"
     elif listed is not None:
