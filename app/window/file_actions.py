@@ -447,7 +447,7 @@ class FileActions(QObject):
         kinds, style = form.kinds, form.export_request
         path = self.ask_save("Export mesh", self._name, kinds) if accepted else None
         if path is not None:
-            document.tasks.write(f"Exporting {path.name}", partial(export, path, style))
+            document.tasks.write(f"Exporting {path.name}", as_task(export, path, style))
 
     def export_print(self) -> None:
         """Ask how and where, and write the pose as one solid for a 3D printer."""
@@ -511,7 +511,7 @@ class FileActions(QObject):
         if is_clip:
             from lcollision_core.tasks import exporting
 
-            job = partial(exporting.export_clips, model, file, changes, path)
+            job = as_task(exporting.export_clips, model, file, changes, path)
             document.tasks.write(f"Exporting {path.name}", job, done)
         else:
             part = motion.part(frames).at_rate(request.fps)
@@ -582,7 +582,7 @@ class FileActions(QObject):
             if not there or ask_to_replace_files(self._window, there):
                 write(label, export, done)
 
-        write(label, partial(exporting.frame_files, model, path, request), ask_and_write)
+        write(label, as_task(exporting.frame_files, model, path, request), ask_and_write)
 
     def screenshot(self) -> None:
         """Ask how and where, and write a screenshot of the view."""

@@ -305,20 +305,8 @@ class SceneBody(Body):
         domains = self._space.vertex_domain
         for member in self.members:
             rules, rows, name = member.body.rules, self.faces_of[member.name], member.name
-            own = {group.name for group in member.body.groups}
-            everyone = np.arange(rows.start, rows.stop)
-            groups.append(FaceGroup(name, everyone))
             is_prop = member.holder is not None or (member.moves and not bends(member.body))
-            for group in member.body.groups:
-                if is_prop and len(group.faces) == len(everyone):
-                    continue  # The prop's name says it: not "sword: Sword".
-                pieces = group.name.split(", ", 1)
-                in_pieces = len(pieces) > 1 and own.issuperset(pieces)
-                label = (
-                    ", ".join(self._in_body(name, piece) for piece in pieces) if in_pieces else ""
-                )
-                called = label or self._in_body(name, group.name)
-                groups.append(replace(group, name=called, faces=group.faces + rows.start))
+            groups += self._groups_of(member, is_prop)
             ignored += [(self._in_body(name, a), self._in_body(name, b)) for a, b in rules.ignored]
             left_out += [self._in_body(name, name_left_out) for name_left_out in rules.left_out]
             tolerated += [
@@ -360,6 +348,21 @@ class SceneBody(Body):
             ),
             (*others, *joints),
         )
+
+    def _groups_of(self, member: SceneMember, is_prop: bool) -> Iterator[FaceGroup]:
+        """Yield the group of all faces of a body, then its own groups, as named in the scene."""
+        own = {group.name for group in member.body.groups}
+        rows, name = self.faces_of[member.name], member.name
+        everyone = np.arange(rows.start, rows.stop)
+        yield FaceGroup(name, everyone)
+        for group in member.body.groups:
+            if is_prop and len(group.faces) == len(everyone):
+                continue  # The prop's name says it: not "sword: Sword".
+            # The name of a branch of two limbs joins the names of both joints.
+            pieces = group.name.split(", ", 1)
+            pieces = pieces if own.issuperset(pieces) else [group.name]
+            label = ", ".join(self._in_body(name, piece) for piece in pieces)
+            yield replace(group, name=label, faces=group.faces + rows.start)
 
     def _held_by(self, holder: SceneMember) -> list[SceneMember]:
         """Return the props that a member holds."""

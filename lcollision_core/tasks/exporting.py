@@ -306,27 +306,17 @@ def write_result(
         )
         return [file if keeps_meshes else replace(file, vertices=None) for file in written]
 
-    path = output.path
     if output.form == "folder":
-        files = files_of(output, model, poses, request)
+        path, files = output.path, files_of(output, model, poses, request)
         n_replaced = sum(file.exists() for file in files)
         with atomic_files(path) as unfinished:
             in_folder = write([unfinished / file.name for file in files])
         _note_written(path, len(poses), n_replaced, in_folder, job)
         _remember(model, output, job)
         return [replace(pose, path=path / pose.path.name) for pose in in_folder]
-    with locked(path):
+    with locked(output.path):
+        path = _path_to_write(output, job)
         n_replaced = int(path.exists())
-        if n_replaced and file_stamp(path) != output.before:
-            path, n_replaced = unused_name(path), 0
-            job.note(
-                say(
-                    "{output} was changed by another command in the meantime and was left alone; "
-                    "the result is in {path}",
-                    output=output.path,
-                    path=path,
-                )
-            )
         meshes: Sequence[WrittenPose] = []
         if output.form == "poses":
             write_poses(path, model, poses)
@@ -352,6 +342,22 @@ def write_result(
     _note_written(path, len(poses), n_replaced, one_each, job)
     _remember(model, output, job)
     return meshes
+
+
+def _path_to_write(output: Output, job: Job) -> Path:
+    """Return the output's path, or a new name with a note if another command has changed it."""
+    path = output.path
+    if path.exists() and file_stamp(path) != output.before:
+        path = unused_name(path)
+        job.note(
+            say(
+                "{output} was changed by another command in the meantime and was left alone; "
+                "the result is in {path}",
+                output=output.path,
+                path=path,
+            )
+        )
+    return path
 
 
 def _remember(model: Body, output: Output, job: Job) -> None:
@@ -389,13 +395,18 @@ def export(
     outcome: ResolveResult | None,
     path: Path,
     request: ExportRequest,
-    _: Job,
     own: Callable[[], PoseSpace] | None = None,
 ) -> str:
     """Write the displayed mesh of a pose, at its placement, and check the file.
 
-    The result of Resolve is written with the vertices of its `outcome`; other frames of a motion
-    use the body in that frame, `own`. Returns a sentence for the status bar.
+    Parameters
+    ----------
+    outcome : the result of Resolve, whose vertices are written if the pose is still that
+    own : makes the pose space of the body in a motion's frame: see `Motion.space_at`
+
+    Returns
+    -------
+    sentence : for the status bar
     """
     placement = pose.placement
     if outcome is not None and np.array_equal(outcome.latent, pose.latent):
@@ -418,7 +429,7 @@ def export(
 
 
 def frame_files(
-    model: Body, path: Path, request: ExportRequest, _: Job
+    model: Body, path: Path, request: ExportRequest
 ) -> tuple[list[Path], SourceFile | None]:
     """Return the files that `export_frames` writes, one per mesh of the source file, and that."""
     source = source_for(path.suffix, model, request.like)
@@ -467,7 +478,6 @@ def export_clips(
     file: Path,
     changes: Sequence[tuple[Motion, Motion]],
     path: Path,
-    _: Job,
 ) -> str:
     """Write the character's file with changed clips, and check their frames.
 
@@ -478,7 +488,7 @@ def export_clips(
 
     Returns
     -------
-    told : a sentence for the status bar
+    sentence : for the status bar
     """
     written = write_clips(
         path,

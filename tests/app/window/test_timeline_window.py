@@ -23,6 +23,7 @@ from app.window.dialogs.forms import MotionDialog
 from app.window.layout import bring_up
 from app.window.main_window import MainWindow
 from app.work.motion_checks import MotionChecks
+from app.work.threads import as_task
 from lcollision_core.bodies import ExportRequest, open_body, read_poses
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
@@ -263,7 +264,7 @@ def test_the_motion_is_resolved_exported_and_read_again(
     assert motion is not None
     assert document.history.modified
     told: list[str] = []
-    job = partial(
+    job = as_task(
         exporting.export_clips, document.model, swing, timeline.changes, tmp_path / "free.glb"
     )
     document.tasks.write("Exporting", job, told.append)

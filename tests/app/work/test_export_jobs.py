@@ -51,7 +51,6 @@ def test_a_pose_goes_into_the_character_s_own_file(
         None,
         path,
         ExportRequest(form=form),
-        Job(),
     )
     again = read_character(path)
     vertices = np.empty_like(character.reference)
@@ -112,7 +111,7 @@ def test_the_user_s_file_is_read_once_for_a_motion(
         tmp_path / "run.pc2",
         Motion("run", np.zeros(1), np.zeros((1, character.latent_size))),
     )
-    files, source = frame_files(character, path, ExportRequest(), Job())
+    files, source = frame_files(character, path, ExportRequest())
     monkeypatch.setattr(model_package, "source_for", None)
     export_frames(character, motion, path, ExportRequest(), Job(), source=source)
     assert len(files) == 3
@@ -136,7 +135,7 @@ def test_the_timeline_of_an_fbx_goes_into_a_rigged_glb_and_that_is_told(tmp_path
     codes = original.codes.copy()
     codes[10:20] = 0.0
     changes = [(original, replace(original, codes=codes))]
-    told = export_clips(model, file, changes, out, Job())
+    told = export_clips(model, file, changes, out)
     assert told.startswith("Exported hero.glb: ")
     assert "FBX can't be written, so hero.fbx comes back as GLB" in told
     frames = read_character(out).sample(CLIP, 30.0).vertices
