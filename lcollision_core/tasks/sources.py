@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,14 @@ from lcollision_core.bodies.rig_body import MOST_NEAR_PAIRS
 from lcollision_core.contact import CollisionDetector, touching_patches
 from lcollision_core.contact.exclusions import near_pairs_estimate
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files import PoseSet, concatenated, read_character, read_pose_set, thinned
+from lcollision_core.files import (
+    Character,
+    PoseSet,
+    concatenated,
+    read_character,
+    read_pose_set,
+    thinned,
+)
 from lcollision_core.files.motion.smpl import is_smpl_model
 from lcollision_core.files.pose_set import disagreement
 from lcollision_core.files.scene.joined import join_parts
@@ -79,15 +86,7 @@ def gather_poses(
     if not paths:
         raise LCollisionError("there is nothing to read poses from", "name a file or a folder")
     files = [Path(path) for path in paths]
-    # Missing files raise when they are read.
-    opened = {
-        file: file if is_smpl_model(file) else open_rigged(file) for file in files if file.is_file()
-    }
-    characters = {
-        file: read_character(document, up)
-        for file, document in opened.items()
-        if document is not None
-    }
+    characters = _characters(files, up)
     rigged = next(iter(characters), None)
     files.sort(key=lambda file: file != rigged)
     character = None if rigged is None else characters[rigged]
@@ -108,23 +107,7 @@ def gather_poses(
             )
         )
 
-    def of_animation(file: Path) -> dict[str, Any]:
-        """Return a file's animation options; with several files, only those it supports."""
-        if len(files) == 1:
-            return {"clip": clip, "fps": fps}
-        if file.suffix.lower() not in SCENE_SUFFIXES:
-            return {}
-        character = characters.get(file)
-        return {"clip": clip if character is None or clip in character.clips else None, "fps": fps}
-
-    pose_sets: list[PoseSet] = []
-    for number, file in enumerate(files):
-        topology = pose_sets[0].topology if pose_sets else None
-        if with_still and file in characters and not characters[file].clips:
-            pose_sets.append(rest_pose_set(characters[file]))
-        else:
-            options = of_animation(file)
-            pose_sets.append(read_pose_set(file, part(number), topology=topology, **options))
+    pose_sets = _read_files(files, characters, {"clip": clip, "fps": fps}, part, with_still)
     if by_rig and rigged is None:
         raise LCollisionError(
             "has no joints to pose it by",
@@ -147,6 +130,45 @@ def gather_poses(
         notes = tuple(dict.fromkeys((*poses.notes, *body.notes)))
         poses = replace(poses, rules=body.rules, groups=body.groups, notes=notes)
     return poses if up is None else replace(poses, up_axis=up)
+
+
+def _characters(files: Sequence[Path], up: int | None) -> dict[Path, Character]:
+    """Read the characters among files; missing files raise later, when they are read."""
+    there = [file for file in files if file.is_file()]
+    opened = [(file, file if is_smpl_model(file) else open_rigged(file)) for file in there]
+    return {file: read_character(document, up) for file, document in opened if document is not None}
+
+
+def _read_files(
+    files: Sequence[Path],
+    characters: Mapping[Path, Character],
+    animation: dict[str, Any],
+    part: Callable[[int], Job],
+    with_still: bool,
+) -> list[PoseSet]:
+    """Read the poses of each file, in the topology of the first.
+
+    Parameters
+    ----------
+    characters : those among the files
+    animation : options of `read_pose_set`; of several files, for those that have them
+    part : returns the job for a file by its number
+    with_still : whether a character without clips has a pose, its rest pose
+    """
+    pose_sets: list[PoseSet] = []
+    for number, file in enumerate(files):
+        character = characters.get(file)
+        if with_still and character is not None and not character.clips:
+            pose_sets.append(rest_pose_set(character))
+            continue
+        options = animation
+        if len(files) > 1 and file.suffix.lower() not in SCENE_SUFFIXES:
+            options = {}
+        elif len(files) > 1 and character is not None and options["clip"] not in character.clips:
+            options = options | {"clip": None}
+        topology = pose_sets[0].topology if pose_sets else None
+        pose_sets.append(read_pose_set(file, part(number), topology=topology, **options))
+    return pose_sets
 
 
 _NEAR_EXCLUSIONS = (0.0, 0.02, 0.05, 0.1)
