@@ -27,11 +27,11 @@ from lcollision_core.contact.exclusions import (
     NearestPair,
     TouchingGroups,
     exclusions_of,
+    listed_exclusions,
     nearness_of,
     require_clearance,
     require_listable,
     rules_of,
-    with_other_rules,
 )
 from lcollision_core.contact.kernels import (
     COINCIDENT,
@@ -320,8 +320,9 @@ class CollisionDetector:
             other = CollisionDetector(self.topology, self.reference, rules, groups, self.body_size)
             other._nearness, other._may_touch = self._nearness, self._may_touch
             return other
-        exclusions = with_other_rules(
-            self._exclusions, rules, self.topology, self.reference, self.body_size, groups
+        near, rest = self._exclusions.near, self._exclusions.rest
+        exclusions = listed_exclusions(
+            near, rest, rules, self.topology, self.reference, self.body_size, groups
         )
         return self._with(
             rules=rules,

@@ -77,7 +77,7 @@ def exclusions_of(
     if rules.rest_exclusion is not None:
         distance = rules.rest_exclusion * body_size
         rest = _about(topology, reference, touching, distance, _REST)
-    return _listed(near, rest, rules, topology, reference, body_size, groups)
+    return listed_exclusions(near, rest, rules, topology, reference, body_size, groups)
 
 
 def _creases(
@@ -114,22 +114,7 @@ def _creases(
     return Creases(reference, length[reached[nearest]], places, np.array(of_joints))
 
 
-def with_other_rules(
-    exclusions: Exclusions,
-    rules: ContactRules,
-    topology: Topology,
-    reference: FloatArray,
-    body_size: float,
-    groups: Sequence[FaceGroup] = (),
-) -> Exclusions:
-    """Return exclusions by other rules, with the same lists of near and touching pairs.
-
-    Parameters and errors are those of `exclusions_of`.
-    """
-    return _listed(exclusions.near, exclusions.rest, rules, topology, reference, body_size, groups)
-
-
-def _listed(
+def listed_exclusions(
     near: Lists,
     rest: Lists,
     rules: ContactRules,

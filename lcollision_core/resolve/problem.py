@@ -107,6 +107,12 @@ class ResolveProblem:
         squared: FloatArray = (latent - self.target) ** 2 @ self.code_weights
         return squared
 
+    def nearest_first(self, latents: FloatArray) -> FloatArray:
+        """Return (F, D) poses with the locked codes of Z*, ordered by distance from it."""
+        kept = np.where(self.movable, latents, self.target)
+        ordered: FloatArray = kept[np.argsort(self.distance(kept), kind="stable")]
+        return ordered
+
     def nearest(self, centre: FloatArray, contacts: Contacts) -> FloatArray | None:
         """Return the pose within all half-spaces nearest to a (D,) pose, None if there is none."""
         half_spaces = contacts.normals, contacts.offsets

@@ -239,8 +239,8 @@ class Ladder:
         least = self._least
         if self.problem.model is None:
             if free is None or least.mean_change(free) > FAR:
-                known = free if free is not None and least.is_within(free) else None
-                pushed = least.push_out(self._put_back, known)
+                within = free if free is not None and least.is_within(free) else None
+                pushed = least.push_out(self._put_back, within)
                 if pushed is not None:
                     free, step = pushed, Step.PUSH_OUT
             if free is not None:
@@ -257,9 +257,8 @@ class Ladder:
             return free, step, None
         if free is not None and self._nearer is not None and least.is_within(self._nearer):
             return self._lifted(self._nearer, least)[0], step, say(FEET_MOVED)
-        starts = np.where(self.problem.movable, self.free_latents, self.problem.target)
-        nearest = starts[np.argsort(self.problem.distance(starts), kind="stable")]
-        latent = least.find([*([] if free is None else [free]), *nearest])
+        known = self.problem.nearest_first(self.free_latents)
+        latent = least.find([*([] if free is None else [free]), *known])
         latent, sunk = self._lifted(latent, least)
         if self.check.is_free(latent):
             return latent, Step.SOFT, sunk
@@ -535,7 +534,7 @@ class PoseResolver:
         self._free_latents: FloatArray = np.array(free_latents, np.float64).reshape(-1, size)
 
     def with_check(self, check: ExactCheck) -> PoseResolver:
-        """Return the resolver with another check, as for poses that something is added to.
+        """Return the resolver with another check, for example of poses with added detail.
 
         Parameters
         ----------
@@ -563,9 +562,9 @@ class PoseResolver:
         options : the defaults if None
         job : reports (steps of the ladder done, all steps); polled at every evaluation
         placement : applied to the pose for export; the exact check is of the placed vertices
-        near : (D,) array, a correction Z - Z* to try first, as of the neighbouring frame
-        before : (D,) array, a further known collision-free pose, as of the neighbouring frame;
-            without a predictor, the search may start from it
+        near : (D,) array, a correction Z - Z* to try first, such as that of the neighbouring frame
+        before : (D,) array, a further known collision-free pose, such as the neighbouring
+            frame; without a predictor, the search may start from it
 
         Returns
         -------

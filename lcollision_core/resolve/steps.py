@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing import DragOptions, ExactCheck, Grip, PoseDragger
+from lcollision_core.posing import DragOptions, DragStep, ExactCheck, Grip, PoseDragger
 from lcollision_core.posing.exact import ContactRegions, Contacts, add_slopes, least_step
 from lcollision_core.resolve.problem import ResolveProblem
 from lcollision_core.resolve.solvers import polish
@@ -64,7 +64,7 @@ def bisect(
 def pull_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> FloatArray:
     """Slide a free pose back, then put each group of codes back alone if that is free.
 
-    As `slide_back`.
+    Parameters and errors are those of `slide_back`.
     """
     return _put_domains_back(check, problem, slide_back(check, problem, free))
 
@@ -116,14 +116,35 @@ def fall_back(
     ------
     CancelledError : the job was cancelled.
     """
-    ends = np.where(problem.movable, free_latents, problem.target)
+
+    def reach(end: FloatArray) -> FloatArray | None:
+        if not check.is_free(end):
+            return None
+        return bisect(check, problem, end, problem.target, FALL_BACK_HALVINGS)[0]
+
+    return _nearest_reached(problem, free_latents, FALL_BACKS, reach)
+
+
+def _nearest_reached(
+    problem: ResolveProblem,
+    free_latents: FloatArray,
+    most: int,
+    reach: Callable[[FloatArray], FloatArray | None],
+) -> FloatArray | None:
+    """Return the pose nearest to Z* that is reached from one of at most `most` known free poses.
+
+    Parameters
+    ----------
+    reach : returns the free pose that a known one leads to; None if that one collides with the
+        locked codes of Z*
+    """
     reached: list[FloatArray] = []
-    for end in ends[np.argsort(problem.distance(ends), kind="stable")]:
+    for end in problem.nearest_first(free_latents):
         problem.deadline.poll()
-        if len(reached) == FALL_BACKS or (reached and problem.deadline.expired):
+        if len(reached) == most or (reached and problem.deadline.expired):
             break
-        if check.is_free(end):
-            reached.append(bisect(check, problem, end, problem.target, FALL_BACK_HALVINGS)[0])
+        if (pose := reach(end)) is not None:
+            reached.append(pose)
     return min(reached, key=problem.distance, default=None)
 
 
@@ -631,12 +652,8 @@ class Standing:
             if vertex < 0:
                 break
             step = dragger.begin(latent, Grip.at(vertex), options=options)
-            for _ in range(_MOST_STANDING_EVENTS):
-                problem.deadline.poll()
-                step = dragger.move(place * check.body_size)
-                if step.settled or problem.deadline.expired:
-                    break
-            latent = step.latent.copy()
+            goal = place * check.body_size
+            latent = _dragged(dragger, step, problem, goal, _MOST_STANDING_EVENTS).latent.copy()
         return self.lifted(check, problem, latent)
 
     def lifted(self, check: ExactCheck, problem: ResolveProblem, latent: FloatArray) -> FloatArray:
@@ -717,19 +734,24 @@ def step_towards(
     dragger = PoseDragger(check)
     locked = frozenset(np.flatnonzero(~problem.movable).tolist())
     options = DragOptions(solid=True, locked_codes=locked, clearance=check.clearance)
-    ends = np.where(problem.movable, free_latents, problem.target)
-    reached: list[FloatArray] = []
-    for end in ends[np.argsort(problem.distance(ends), kind="stable")]:
-        problem.deadline.poll()
-        if len(reached) == STARTS or (reached and problem.deadline.expired):
-            break
+
+    def reach(end: FloatArray) -> FloatArray | None:
         step = dragger.begin(end, None, options=options)
         if not step.exactly_free:
-            continue
-        for _ in range(_MOST_DRAG_EVENTS):
-            problem.deadline.poll()
-            step = dragger.move(problem.target)
-            if step.settled or problem.deadline.expired:
-                break
-        reached.append(step.latent.copy())
-    return min(reached, key=problem.distance, default=None)
+            return None
+        step = _dragged(dragger, step, problem, problem.target, _MOST_DRAG_EVENTS)
+        return step.latent.copy()
+
+    return _nearest_reached(problem, free_latents, STARTS, reach)
+
+
+def _dragged(
+    dragger: PoseDragger, step: DragStep, problem: ResolveProblem, target: FloatArray, most: int
+) -> DragStep:
+    """Move towards a target until the drag settles, or for `most` events."""
+    for _ in range(most):
+        problem.deadline.poll()
+        step = dragger.move(target)
+        if step.settled or problem.deadline.expired:
+            break
+    return step
