@@ -94,7 +94,7 @@ class _Loop:
         return self._made(*args)
 
     def __getattr__(self, name: str) -> Any:
-        """Return an attribute of what numba has made, which other loops that call this one need."""
+        """Return an attribute of the compiled function, for other loops that call it."""
         return getattr(self._made, name)
 
 

@@ -279,7 +279,7 @@ class PoseMotion(QObject):
             self._history.close_gesture()
 
     def cancel_gesture(self) -> None:
-        """Cancel a drag and restore its start exactly, as for Escape."""
+        """Cancel a drag, as Escape does, and restore its start exactly."""
         self._stop()
         self._history.cancel_gesture()
 

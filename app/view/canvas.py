@@ -507,7 +507,7 @@ class Mouse(QObject):
         document.history.pins_changed.connect(self.redraw_wanted)
 
     def reset(self) -> None:
-        """Forget the pointed vertex and the drag, as for another model."""
+        """Forget the pointed vertex and the drag, which belong to the previous model."""
         self._forget_drag()
         self.arrows = None
         self._handles = handles_of(self._document.model.space)

@@ -126,7 +126,7 @@ class Scene:
             self._lay_floor()
 
     def set_plain_background(self, colour: str) -> None:
-        """Set a background of one colour, "#rrggbb", as for transparent pictures."""
+        """Set a background of one colour, "#rrggbb", for example for transparent pictures."""
         self._renderer.set_background(colour)
 
     def show(

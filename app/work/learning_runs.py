@@ -46,7 +46,7 @@ _FULL = "the disk is full: {0:.0f} MB are left at {1}; free some space, then con
 
 @dataclass(frozen=True)
 class LearningRun:
-    """One run as of the last look.
+    """One run, as it was when its folder was last read.
 
     Attributes
     ----------

@@ -138,7 +138,7 @@ def mirrored(body: Body, pairs: Iterable[FacePair]) -> list[FacePair]:
 def places_of(body: Body, pairs: Iterable[FacePair]) -> dict[tuple[str, str], int]:
     """Count pairs of faces by the names of their body parts, meshes or, without either, components.
 
-    Meshes name two faces of one body part if they differ, as for an arm and its bracer.
+    Meshes name two faces of one body part if they differ, such as an arm and its bracer.
     """
     file_groups, parts, components = (body.groups_by_kind[kind] for kind in GROUP_KINDS)
     names = []

@@ -461,7 +461,7 @@ class HumanDraws:
 
     @cached_property
     def _chain(self) -> npt.NDArray[np.int64]:
-        """(J,) first joint of each joint's chain of one role, as of a spine or a finger."""
+        """(J,) first joint of each joint's chain of one role, such as of a spine or a finger."""
         chain = np.arange(self.space.n_joints)
         roles, parents = self.space.roles, self.space.rig.parents
         for joint, parent in enumerate(parents):

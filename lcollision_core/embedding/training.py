@@ -95,7 +95,7 @@ def train_embedding(
 
 
 def require_several(pose_set: PoseSet) -> None:
-    """Refuse a single pose, as of a set whose poses are nearly the same, with a `PoseSetError`."""
+    """Raise a `PoseSetError` for a single pose, such as one that is left of nearly equal poses."""
     if len(pose_set) < 2:
         raise PoseSetError("one pose isn't enough to learn from", "add poses that differ from it")
 

@@ -189,9 +189,10 @@ def without_body(scene: SceneBody, name: str) -> str:
 
 
 def carried_pose(pose: NamedPose, before: Body, after: Body, removed: str = "") -> NamedPose | None:
-    """Return a pose of a body or a scene in one with other bodies besides, at rest, or fewer.
+    """Return a pose of a body or a scene as one of a scene with more or fewer bodies.
 
-    Bodies are those of the same name; a body alone has none. None if no body is in both.
+    Added bodies are at rest. Bodies match by name, and a body alone matches any name; None if none
+    is in both.
 
     Parameters
     ----------
