@@ -81,6 +81,11 @@ class StatusBar(QStatusBar):
         elif self.currentMessage() == self._hint:
             self.clearMessage()
 
+    def show_tip(self, tip: str) -> None:
+        """Show the tip of what the pointer is over, but not in place of a message."""
+        if not tip or self.currentMessage() in ("", self._hint):
+            self.show_hint(tip)
+
     def show_facts(self, facts: str) -> None:
         """Show facts about the model."""
         text, middle = one_line(facts), Qt.TextElideMode.ElideMiddle

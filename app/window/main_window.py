@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QEvent, Qt, QTimer, Signal, Slot
-from PySide6.QtGui import QCloseEvent, QGuiApplication, QShowEvent
+from PySide6.QtGui import QCloseEvent, QGuiApplication, QShowEvent, QStatusTipEvent
 from PySide6.QtWidgets import QApplication, QDialog, QWidget
 
 from app.editing.settings import Settings
@@ -139,6 +139,13 @@ class MainWindow(EditorWindow):
             if isinstance(widget, QDialog):
                 widget.reject()
         self.close()
+
+    def event(self, event: QEvent) -> bool:
+        """Keep a message that Qt would clear when the pointer leaves a button."""
+        if isinstance(event, QStatusTipEvent):
+            self._status.show_tip(event.tip())
+            return True
+        return super().event(event)
 
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
         """Refresh the pose library when activated: another editor may have changed it."""

@@ -22,6 +22,7 @@ from PySide6.QtWidgets import (
     QLabel,
     QMessageBox,
     QProgressBar,
+    QToolBar,
     QToolTip,
     QWidget,
 )
@@ -242,6 +243,25 @@ def test_a_message_too_long_for_the_status_bar_is_shown_whole(window: MainWindow
     facts = next(label for label in bar.findChildren(QLabel) if "…" in label.text())
     assert facts.width() < bar.width() / 3
     assert facts.toolTip() == "a name that does not end " * 9
+
+
+def test_a_message_outlives_the_pointer_s_way_over_a_button(window: MainWindow) -> None:
+    bar, action = window.statusBar(), window.actions_by_key["open"]
+    (tool_bar,) = window.findChildren(QToolBar)
+    button = tool_bar.widgetForAction(action)
+    QTest.mouseMove(button)
+    assert bar.currentMessage() == action.statusTip()
+    window.document.message.emit("All are free now")
+    QTest.mouseMove(window.viewport)
+    assert bar.currentMessage() == "All are free now"
+    QTest.mouseMove(button)
+    assert bar.currentMessage() == "All are free now"
+    bar.clearMessage()
+    QTest.mouseMove(window.viewport)
+    QTest.mouseMove(button)
+    assert bar.currentMessage() == action.statusTip()
+    QTest.mouseMove(window.viewport)
+    assert bar.currentMessage() == ""
 
 
 def words_on_the_screen(window: MainWindow) -> Iterator[str]:
