@@ -245,7 +245,14 @@ def _followed(
     figure = with_chosen_roles(stick_figure(motion, rest, motion.up), chosen_partners, space)
     anatomy = _facing(anatomy_of(figure), motion.front)
     partner = partners(motion, anatomy, space, chosen_partners)
-    unsure = frozenset() if chosen_partners else unsure_joints(partner, figure, anatomy, space)
+    unsure = unsure_joints(partner, figure, anatomy, space)
+    if chosen_partners:
+        # Choices that are too few to move the limbs are asked for again.
+        asks = len(followed_limbs(partner, space)) < LEAST_JOINTS
+        kinds = zip(space.rig.joint_names, space.roles, partner, strict=True)
+        unsure = frozenset(
+            name for name, role, other in kinds if asks and role in ALIGNED and other < 0
+        )
     return figure, anatomy, partner, unsure
 
 

@@ -54,6 +54,8 @@ class JointsDialog(Dialog):
     chosen = Signal(object)
 
     def __init__(self, match: JointMatch, motion: str, body: str, parent: QWidget) -> None:
+        from lcollision_core.bodies.partners import LEAST_JOINTS
+
         super().__init__("Joints of the motion", parent)
         self.resize(680, 680)
         self._match = match
@@ -70,7 +72,8 @@ class JointsDialog(Dialog):
                 cards.append(self._card(title, rows, motion, body))
         about = (
             f"Each joint of “{body}” turns as the joint of “{motion}” that is chosen beside it. "
-            "A joint without one moves with its parent."
+            "A joint without one moves with its parent; "
+            f"at least {LEAST_JOINTS} shoulders, elbows, hips and knees need one."
         )
         if match.unsure:
             about += " The joints at the top could not be matched by name and position."

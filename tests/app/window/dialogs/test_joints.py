@@ -88,3 +88,37 @@ def test_what_is_unsure_is_asked_once_and_remembered(
     (again,) = shown_dialogs(window)
     assert again.choices["LeftForeArm"].currentData() is None
     again.reject()
+
+
+@pytest.mark.slow
+def test_too_few_chosen_joints_are_asked_for_again(
+    qtbot: QtBot,
+    window: MainWindow,
+    swing: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    document, timeline = window.document, window.document.timeline
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        drop(window, swing)
+    path = renamed(swing, tmp_path / "unsure.glb", {"LeftArm": "bone 7", "LeftForeArm": "bone 8"})
+    with qtbot.waitSignal(timeline.joints_unsure, timeout=PATIENCE):
+        drop(window, path)
+    (dialog,) = shown_dialogs(window)
+    before, limbs = timeline.motion, ("LeftArm", "RightArm", "LeftLeg")
+    for joint in limbs:
+        dialog.choices[joint].setCurrentIndex(0)
+    with qtbot.waitSignal(timeline.joints_unsure, timeout=PATIENCE):
+        dialog.use.click()
+    assert timeline.motion is before
+    # Not a failure, from which nothing leads back to the choice.
+    (again,) = shown_dialogs(window)
+    assert timeline.joints is not None
+    assert timeline.joints.unsure == set(limbs)
+    assert {*list(again.choices)[:3]} == set(limbs)
+    with qtbot.waitSignal(timeline.arrived, timeout=PATIENCE):
+        again.choices["RightArm"].setCurrentText("a RightArm")
+        again.use.click()
+    assert not shown_dialogs(window)
+    rest(qtbot, window)
