@@ -252,6 +252,9 @@ class MainWindow(EditorWindow):
         # A single body needs no list.
         n_bodies = self.bodies.n_bodies
         self.docks["bodies"].toggleViewAction().setVisible(n_bodies > 1)
+        if n_bodies < 2 and self.docks["bodies"].isAncestorOf(self.focusWidget()):
+            # Otherwise the search field gets the focus, and takes the keys of the view.
+            self.viewport.setFocus()
         self.docks["bodies"].setVisible(n_bodies > 1)
         # The new model's names may be longer.
         self._layout.fit()

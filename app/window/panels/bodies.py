@@ -83,6 +83,8 @@ class BodiesPanel(QWidget):
         self.tree.setTextElideMode(Qt.TextElideMode.ElideMiddle)
         self.tree.setRootIsDecorated(False)
         self.tree.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
+        # Otherwise the arrow keys do not reach the boxes.
+        self.tree.setSelectionBehavior(QAbstractItemView.SelectionBehavior.SelectItems)
         header = self.tree.header()
         header.setStretchLastSection(False)
         header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
@@ -130,7 +132,6 @@ class BodiesPanel(QWidget):
     def _follow(self) -> None:
         scene = self.scene
         if scene is None:
-            self.tree.clear()
             return
         if scene.fingerprint != self._fingerprint:
             self._fingerprint = scene.fingerprint

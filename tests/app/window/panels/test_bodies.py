@@ -12,6 +12,7 @@ import pytest
 import pyvista
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QAccessible, QImage
+from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
     QAbstractSpinBox,
     QDialog,
@@ -115,6 +116,13 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
         assert second is not None
         second.setCheckState(3, Qt.CheckState.Unchecked)
     assert document.model.rules.left_out == ("hero 2",)
+    # The boxes are reached by keys alone.
+    tree.setCurrentItem(tree.topLevelItem(0), 0)
+    for key in (Qt.Key.Key_Right, Qt.Key.Key_Right, Qt.Key.Key_Space):
+        QTest.keyClick(tree, key)
+    assert set(scene.domains_of_member("hero")) <= document.motion.locked_domains
+    QTest.keyClick(tree, Qt.Key.Key_Space)
+    assert not set(scene.domains_of_member("hero")) & document.motion.locked_domains
     # Screen readers read a name of everything that takes the focus.
     for widget in window.findChildren(QWidget):
         takes_focus = widget.focusPolicy() & Qt.FocusPolicy.TabFocus and widget.isVisible()
@@ -306,7 +314,10 @@ def test_a_body_is_removed_and_the_others_keep_their_pose(
     for name in ("hero", "hero 3"):
         codes = pair.codes_of_member(name, document.history.latent)
         np.testing.assert_array_equal(codes, posed[name])
+    window.bodies.remove.setFocus()
     remove(0)
+    # The list is gone, and the keys go to the view, not into a search field.
+    assert window.viewport.hasFocus()
     # What is left is no scene.
     assert as_scene(document.model) is None
     assert document.model.fingerprint == open_body(hero).fingerprint
