@@ -485,8 +485,11 @@ class FailureDialog(Dialog):
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         buttons.addButton(self.unfold, QDialogButtonBox.ButtonRole.ActionRole)
         buttons.addButton(log, QDialogButtonBox.ButtonRole.ActionRole)
-        buttons.button(QDialogButtonBox.StandardButton.Close).setDefault(True)
+        close = buttons.button(QDialogButtonBox.StandardButton.Close)
+        close.setDefault(True)
         self.setLayout(dialog_vbox(top, self.details, buttons))
+        # Otherwise the first button looks chosen, but Enter presses this one.
+        close.setFocus()
         self.unfold.toggled.connect(self._on_unfold)
         log.clicked.connect(open_log_file)
         buttons.rejected.connect(self.reject)

@@ -128,6 +128,9 @@ def test_a_letter_presses_its_button_also_after_its_text_has_changed(
     dialog.show()
     dialog.activateWindow()
     qtbot.waitUntil(dialog.isActiveWindow)
+    # Enter presses the button that has the focus.
+    (focused,) = (one for one in dialog.findChildren(QPushButton) if one.hasFocus())
+    assert focused.isDefault()
     for unfolded in (True, False):
         QApplication.sendPostedEvents()
         letter = mnemonic(dialog.unfold.text())
