@@ -28,6 +28,7 @@ from lcollision_core.motion.motion import (
     windows,
 )
 from lcollision_core.motion.span_program import SMOOTHNESS, SpanProgram, TimeKernel
+from lcollision_core.motion.stuck_pairs import DomainPair, stuck_pairs
 from lcollision_core.options import MotionOptions
 from lcollision_core.resolve import BodyAlone, PoseResolver
 from lcollision_core.resolve.problem import single_torch_thread
@@ -156,7 +157,13 @@ def resolve_motion(
     ):
         watched = job.part() if stop is None else Job(None, job, stop)
 
-        def begin(motion: Motion, job_of_check: Job, checking: Job) -> _Resolution:
+        def begin(
+            motion: Motion,
+            chosen: MotionOptions,
+            job_of_check: Job,
+            checking: Job = UNWATCHED,
+            resolver: PoseResolver = resolver,
+        ) -> _Resolution:
             is_cycle = motion.is_cycle
             frames = Frames(
                 motion.two_turns() if is_cycle else motion,
@@ -174,15 +181,26 @@ def resolve_motion(
             run.guard = replace(run.guard, frames=replace(frames, job=job.part()))
             run.frames, run.outer = replace(frames, job=watched), outer
             run.job, run.stop, run.done, run.keep = job, stop, done or {}, keep
+            run.begin_without = begin_without
             return run
 
-        run = begin(motion, watched, Job(checking))
+        def begin_without(
+            domain_pairs: Sequence[DomainPair], locked: Sequence[int], motion: Motion
+        ) -> _Resolution:
+            check = resolver.check.without_pairs(domain_pairs)
+            locks = chosen.frame.locked_codes.union(locked)
+            options = replace(chosen, frame=replace(chosen.frame, locked_codes=locks))
+            rest = begin(motion, options, job.part(), resolver=resolver.with_check(check))
+            rest.job, rest.done, rest.keep, rest.begin_without = job.part(), {}, None, None
+            return rest
+
+        run = begin(motion, chosen, watched, Job(checking))
         bodies = [body for body in resolver.bodies if not body.is_locked(chosen.frame)]
         is_plain = motion.placements is None and motion.hidden is None and motion.contacts is None
         if len(bodies) > 1 and is_plain and run.wanted.any():
             reports = _Reports(job, len(bodies) + 1)
             each, is_rough = _each_by_itself(run, bodies, up, workers, reports)
-            together = begin(each, job.part(), UNWATCHED)
+            together = begin(each, chosen, job.part())
             # Where bodies meet, poses that contacts allow came back, and ended in jerks.
             together.cuts_off = True
             together.job = job.part(reports.of(len(bodies)))
@@ -298,6 +316,8 @@ class _Resolution:
     freed : for a span, the corrections that free frames of its unfinished window, by frame
     n_frames, n_done : number of frames of spans, and of those that are done
     cuts_off : see `SpanProgram`
+    begin_without : begins again without pairs of faces of some pairs of domains, with some codes
+        locked, on another motion
     """
 
     motion: Motion
@@ -330,6 +350,9 @@ class _Resolution:
     n_frames: int = 0
     n_done: float = 0.0
     cuts_off: bool = False
+    begin_without: Callable[[Sequence[DomainPair], Sequence[int], Motion], _Resolution] | None = (
+        None
+    )
 
     @classmethod
     def begin(
@@ -422,17 +445,14 @@ class _Resolution:
             spans = self._spans()
             todo = [span for span in spans if np.isin(touching, np.asarray(span) % self.n).any()]
         if not self._is_stopped:
+            self._free_other_pairs()
             self._soften()
         return self._resolved(tuple(touching.tolist()) if self.options.continuous else None)
 
     def _resolved(self, touching: tuple[int, ...] | None = None) -> ResolvedMotion:
         """Return the current state as a result."""
         again = np.arange(len(self.motion)) % self.n
-        for span in runs(self.is_changed):
-            if np.array_equal(
-                self.codes[span.start : span.stop], self.motion.codes[self._own(span)]
-            ):
-                self._put_back(span)
+        self._put_back_unmoved()
         return ResolvedMotion(
             replace(self.motion, codes=self.codes[again]),
             self.before,
@@ -491,6 +511,13 @@ class _Resolution:
     def _own(self, span: range) -> npt.NDArray[np.intp]:
         """Return the indices of a span's frames, modulo n."""
         return np.asarray(span) % self.n
+
+    def _put_back_unmoved(self) -> None:
+        for span in runs(self.is_changed):
+            if np.array_equal(
+                self.codes[span.start : span.stop], self.motion.codes[self._own(span)]
+            ):
+                self._put_back(span)
 
     def _put_back(self, span: range) -> None:
         own = self._own(span)
@@ -773,9 +800,39 @@ class _Resolution:
     def _fractions(self) -> list[FloatArray]:
         return [_fractions(self.options.substeps)] * self.n
 
+    def _free_other_pairs(self) -> None:
+        """Resolve what is left without the pairs that are stuck, where that makes nothing worse."""
+        left = np.flatnonzero(self.colliding & (self.barred | ~self.after)).tolist()
+        if self.begin_without is None or not left:
+            return
+        current = replace(self.motion, codes=self.codes[np.arange(len(self.motion)) % self.n])
+        stuck, held = stuck_pairs(replace(self.guard.frames, motion=current), left)
+        if not stuck:
+            return
+        nothing: list[int] = []
+        # First, lock what is stuck; move it too if that frees nothing.
+        for locked in (held.tolist(), nothing):
+            codes = self.begin_without(stuck, locked, current).result().motion.codes[: self.n]
+            spans = runs((codes != self.codes).any(axis=1))
+            taken = [self._takes(span, codes[span.start : span.stop]) for span in spans]
+            if any(taken):
+                break
+
+    def _takes(self, span: range, codes: FloatArray) -> bool:
+        """Set the (len(span), D) codes of a span unless that makes something worse."""
+        own = slice(span.start, span.stop)
+        before = self.codes[own].copy(), self.after[own].copy(), self.is_changed[own].copy()
+        self.codes[own], self.is_changed[own] = codes, True
+        if not self.guard.faults(span, self.codes, self.after, self._fractions):
+            return True
+        self.codes[own], self.after[own], self.is_changed[own] = before
+        return False
+
     def _soften(self) -> None:
-        """Reduce the overlap of barred frames, where that makes nothing worse."""
-        for run in colliding_spans(self.colliding & self.barred, 0, None, self.is_cycle):
+        """Reduce the overlap of frames that stayed, where that makes nothing worse."""
+        self._put_back_unmoved()
+        left = self.colliding & ~self.is_changed
+        for run in colliding_spans(left, 0, None, self.is_cycle):
             span = self._eased(run)
             own = self._own(span)
             wanted = np.zeros(self.motion.codes[own].shape)

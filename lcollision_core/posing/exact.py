@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
+from itertools import chain
 from typing import Any
 
 import daqp
@@ -23,7 +24,7 @@ from lcollision_core.contact import (
 from lcollision_core.contact.kernels import COUNTED
 from lcollision_core.devices import uses_gpu
 from lcollision_core.files import can_hold
-from lcollision_core.meshes import RigidTransform, Topology
+from lcollision_core.meshes import FaceGroup, RigidTransform, Topology
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.pose_space import PosesOnGpu, PoseSpace
 
@@ -139,6 +140,19 @@ class ExactCheck:
         if clearance == self.clearance:
             return self
         return replace(self, detector=self.detector.with_clearance(clearance))
+
+    def without_pairs(self, domain_pairs: Collection[tuple[int, int]]) -> ExactCheck:
+        """Return the check in which pairs of one face from each of two domains do not count."""
+        detector, topology = self.detector, self.detector.topology
+        domain_of = self.space.vertex_domain[topology.faces[:, 0]]
+        name = "domain {} of the check".format
+        groups = [
+            FaceGroup(name(domain), np.flatnonzero(domain_of == domain))
+            for domain in sorted(set(chain(*domain_pairs)))
+        ]
+        ignored = tuple((name(one), name(other)) for one, other in domain_pairs)
+        rules = replace(detector.rules, ignored=detector.rules.ignored + ignored)
+        return replace(self, detector=detector.with_rules(rules, (*detector.groups, *groups)))
 
     @cached_property
     def _seeing(self) -> CollisionDetector:

@@ -205,14 +205,14 @@ def test_a_correction_that_jerks_is_left_out_and_named(monkeypatch: pytest.Monke
     require_no_worse(body, motion, found, ResolveOptions().largest_change or np.inf)
 
 
-def in_the_trunk(frames: range) -> tuple[RigBody, Motion]:
+def in_the_trunk(frames: range, size: float = 3.0) -> tuple[RigBody, Motion]:
     """Return the swing; in `frames`, a morph turns the head into a ball around the neck."""
     body, motion = swinging()
     is_head = body.space.vertex_domain == body.domain_names.index("Head")
     space = body.space
     shape = space.rest_vertices.copy()
     neck = space.origins[space.rig.joint_names.index("Neck")]
-    shape[is_head] = neck + 3.0 * (shape[is_head] - shape[is_head].mean(axis=0))
+    shape[is_head] = neck + size * (shape[is_head] - shape[is_head].mean(axis=0))
     sunk = space.shaped_as(np.zeros(body.latent_size), shape)
 
     def space_at(time: float) -> RigPoseSpace:
@@ -239,6 +239,28 @@ def test_what_no_joint_can_free_stays_and_its_neighbours_are_freed() -> None:
     names = {body.domain_names[part] for part in kept.parts[0]}
     assert "Head" in names
     assert kept.sentence(body.domain_names).startswith("frames 2 to 4 stay as they were: ")
+    require_no_worse(body, motion, found, 0.25)
+
+
+def test_what_no_joint_can_free_does_not_keep_other_limbs_as_they_were() -> None:
+    body, motion = in_the_trunk(range(19), size=1.5)
+    motion = motion.part(range(11, 19))
+    check = body.exact_check()
+    head = body.domain_names.index("Head")
+
+    def limbs(motion: Motion) -> list[int]:
+        """Return the frames in which something collides besides the head."""
+        return [
+            one.frame
+            for one in screen_motion(motion, check).colliding
+            if any(head not in pair for pair in one.domains)
+        ]
+
+    found = resolve_motion(body.resolver, motion, UP)
+    assert limbs(motion)
+    assert limbs(found.motion) == []
+    assert {(kept.reason, kept.is_original) for kept in found.kept} == {(Reason.NO_JOINT, False)}
+    assert all(head in kept.parts[0] for kept in found.kept)
     require_no_worse(body, motion, found, 0.25)
 
 
