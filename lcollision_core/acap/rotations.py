@@ -89,7 +89,9 @@ def split_gradients(gradients: FloatArray, quaternions: FloatArray, stretches: F
     u, v, rotation = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     left, value = np.empty((3, 3)), np.empty(3)
     for i in range(len(gradients)):
-        u[:] = gradients[i]
+        for a in range(3):
+            for b in range(3):
+                u[a, b] = gradients[i, a, b]
         _orthogonalise(u, v)
         for a in range(3):
             value[a] = math.sqrt(u[0, a] * u[0, a] + u[1, a] * u[1, a] + u[2, a] * u[2, a])
@@ -322,7 +324,8 @@ def consistent_logarithms(
             for a in range(3):
                 start[a] = length * q[1 + a] / half_sine if extra != 0 else 0.0
             _choose_turn(q, start, trial[root])
-            carried[root] = trial[root]
+            for a in range(3):
+                carried[root, a] = trial[root, a]
             total = 0.0
             for k in range(begin, end):
                 vertex = order[k]
@@ -335,5 +338,6 @@ def consistent_logarithms(
             if not total >= least:
                 least = total
                 for k in range(begin, end):
-                    logs[order[k]] = trial[order[k]]
+                    for a in range(3):
+                        logs[order[k], a] = trial[order[k], a]
         begin = end
