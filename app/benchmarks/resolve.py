@@ -1,8 +1,9 @@
 """Resolve on colliding poses, by solver, against bisection without learning.
 
 For a character, which has no predictor, the steps of Resolve run once on each pose, and the
-results are checked by all pairs of faces, without a tree. Beside them stand the ends of solid drags
-to the same poses, the nearest of those from all starter poses.
+results are checked by all pairs of faces, without a tree. For poses made by people, or like theirs,
+the ends of solid drags to the same poses stand beside them, the nearest of those from all starter
+poses.
 
 Each solver runs twice on each pose, on one core: alone, for the paper's figures of merit (whether
 its point is feasible for the classifier, and how much of the exact energy it removes), and with
@@ -38,7 +39,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.benchmarks.measures import Row, is_free_by_brute_force, least_by_brute_force
-from lcollision_core.bodies import Body, sample_poses
+from lcollision_core.bodies import Body, read_poses, sample_poses
 from lcollision_core.contact import DISTANCE_BOUND
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import PoseSet
@@ -162,6 +163,20 @@ def real_poses(
     return CollidingPoses(
         np.stack([pose.latent for pose in encoded]), [pose.placement for pose in encoded]
     )
+
+
+def poses_of_file(model: Body, path: Path, n_poses: int) -> CollidingPoses:
+    """Read the first `n_poses` poses of a file that intersect themselves.
+
+    Raises
+    ------
+    LCollisionError : the file is not of this body, or no pose collides.
+    """
+    latents = np.stack([pose.latent for pose in read_poses(path, model)])
+    colliding = latents[~model.exact_check().are_free(latents)][:n_poses]
+    if len(colliding) == 0:
+        raise LCollisionError(f"no pose of {path} intersects itself", "name another file")
+    return CollidingPoses(colliding, [None] * len(colliding))
 
 
 def score_baseline(model: Body, poses: CollidingPoses, clearance: float = 0.0) -> Row:

@@ -121,7 +121,7 @@ def resolve(
         typer.Option(
             metavar="PATH",
             readable=False,
-            help="Resolve the self-intersecting poses of this set, not samples.",
+            help="Resolve the self-intersecting poses of this set or pose file, not samples.",
         ),
     ] = None,
     made: Annotated[
@@ -153,6 +153,7 @@ def resolve(
     from app.benchmarks.resolve import (
         draw_histograms,
         made_poses,
+        poses_of_file,
         real_poses,
         sampled_poses,
         score_baseline,
@@ -176,7 +177,9 @@ def resolve(
     runs = []
     with cancel_on_interrupt() as job:
         with progress_bar("Choosing poses", job) as bar:
-            if data is not None:
+            if data is not None and data.suffix.lower() == ".json":
+                poses = poses_of_file(model, data, n_poses)
+            elif data is not None:
                 poses = real_poses(model, read_pose_set(data), n_poses, bar)
             else:
                 draw = made_poses if made else sampled_poses
@@ -184,7 +187,7 @@ def resolve(
         rows.append(score_baseline(model, poses, clearance))
         if not model.has_predictor:
             rows[0]["confirmed_free_rate"] = None
-            if made:
+            if made or data is not None:
                 with progress_bar("Dragging", job) as bar:
                     rows.append(score_drags(model, poses, options, bar))
             with progress_bar("Resolving", job) as bar:

@@ -77,3 +77,8 @@ def test_a_character_file_is_dragged_and_resolved(lcollision: Lcollision, tmp_pa
     _, soft = json.loads(lcollision(*command, "--soft", "0.002").stdout)
     assert soft["largest_change"] <= 0.002
     assert 0.0 < soft["overlap_left"] < 1.0
+    poses = str(tmp_path / "poses.json")
+    assert lcollision("sample", str(path), "-n", "2", "--colliding", "-o", poses).exit_code == 0
+    own = json.loads(lcollision(*command, "--data", poses).stdout)
+    assert [row["solver"] for row in own] == ["bisection", "drags", "steps"]
+    assert {row["poses"] for row in own} == {2}
