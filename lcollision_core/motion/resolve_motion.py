@@ -316,8 +316,7 @@ class _Resolution:
     freed : for a span, the corrections that free frames of its unfinished window, by frame
     n_frames, n_done : number of frames of spans, and of those that are done
     cuts_off : see `SpanProgram`
-    begin_without : begins again without pairs of faces of some pairs of domains, with some codes
-        locked, on another motion
+    begin_without : begins again without some pairs of domains, some codes locked, on a motion
     """
 
     motion: Motion
@@ -445,8 +444,7 @@ class _Resolution:
             spans = self._spans()
             todo = [span for span in spans if np.isin(touching, np.asarray(span) % self.n).any()]
         if not self._is_stopped:
-            self._free_other_pairs()
-            self._soften()
+            self._improve_rest()
         return self._resolved(tuple(touching.tolist()) if self.options.continuous else None)
 
     def _resolved(self, touching: tuple[int, ...] | None = None) -> ResolvedMotion:
@@ -800,22 +798,29 @@ class _Resolution:
     def _fractions(self) -> list[FloatArray]:
         return [_fractions(self.options.substeps)] * self.n
 
+    def _improve_rest(self) -> None:
+        """Resolve or soften what is left, until a stop."""
+        try:
+            self._free_other_pairs()
+            self._soften()
+        except CancelledError:
+            if self.job.cancelled:
+                raise
+
     def _free_other_pairs(self) -> None:
         """Resolve what is left without the pairs that are stuck, where that makes nothing worse."""
         left = np.flatnonzero(self.colliding & (self.barred | ~self.after)).tolist()
         if self.begin_without is None or not left:
             return
         current = replace(self.motion, codes=self.codes[np.arange(len(self.motion)) % self.n])
-        stuck, held = stuck_pairs(replace(self.guard.frames, motion=current), left)
+        stuck, held = stuck_pairs(replace(self.frames, motion=current), left)
         if not stuck:
             return
-        nothing: list[int] = []
         # First, lock what is stuck; move it too if that frees nothing.
-        for locked in (held.tolist(), nothing):
+        for locked in (held.tolist(), list[int]()):
             codes = self.begin_without(stuck, locked, current).result().motion.codes[: self.n]
             spans = runs((codes != self.codes).any(axis=1))
-            taken = [self._takes(span, codes[span.start : span.stop]) for span in spans]
-            if any(taken):
+            if [span for span in spans if self._takes(span, codes[span.start : span.stop])]:
                 break
 
     def _takes(self, span: range, codes: FloatArray) -> bool:

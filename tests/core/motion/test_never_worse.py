@@ -23,7 +23,7 @@ from lcollision_core.bodies.motions import (
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.contact import DEPTH_TOLERANCE
 from lcollision_core.files import Rig
-from lcollision_core.jobs import UNWATCHED
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import Topology
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import (
@@ -278,6 +278,25 @@ def test_within_a_small_change_a_span_gets_less_overlap() -> None:
     assert 0.0 < kept.deepest < 0.9 * was
     assert "overlap as little as was found" in kept.sentence(body.domain_names)
     require_no_worse(body, motion, found, 0.02)
+
+
+def test_a_stop_while_overlap_is_reduced_keeps_what_was_freed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    body, motion = in_the_trunk(range(2, 5))
+    motion, stop = motion.part(range(2, 10)), Job()
+    softened = Frames.softened
+
+    def stopped(frames: Frames, frame: int) -> np.ndarray:
+        stop.cancel()
+        return softened(frames, frame)
+
+    monkeypatch.setattr(Frames, "softened", stopped)
+    found = resolve_motion(body.resolver, motion, UP, stop=stop)
+    assert stop.cancelled
+    assert not found.after[:3].any()
+    assert found.after[3:].all()
+    assert [kept.frames for kept in found.kept] == [(0, 2)]
 
 
 def waving() -> tuple[RigBody, Motion]:
