@@ -54,21 +54,22 @@ def stuck_pairs(
     overlaps = frames.pool.map(lambda at: frames.check(at).collisions(poses[at]), numbers)
     for frame, overlap in zip(numbers, overlaps, strict=True):
         faces = space.topology.faces[overlap.pairs]
-        owners = np.sort(space.vertex_domain[faces[:, :, 0]]).tolist()
-        for (one, other), depth, corners in zip(
-            owners, overlap.penetration_depth.tolist(), faces.tolist(), strict=True
-        ):
+        owners = np.sort(space.vertex_domain[faces[:, :, 0]])
+        pairs, of_row = np.unique(owners, axis=0, return_inverse=True)
+        for number, (one, other) in enumerate(pairs.tolist()):
+            is_of = of_row.ravel() == number
+            depth = float(overlap.penetration_depth[is_of].max())
             contact = contacts.setdefault((one, other), _Contact((depth, frame)))
             contact.deepest = max(contact.deepest, (depth, frame))
-            contact.corners.update(*corners)
+            contact.corners.update(np.unique(faces[is_of]).tolist())
 
     def is_stuck(pair: DomainPair) -> bool:
         check = frames.resolver.check.without_pairs(contacts.keys() - {pair})
         alone = replace(frames, resolver=frames.resolver.with_check(check))
         return alone.resolved(contacts[pair].deepest[1]) is None
 
-    pairs = list(contacts) if len(contacts) > 1 else []
-    stuck = list(compress(pairs, frames.pool.map(is_stuck, pairs)))
+    several = list(contacts) if len(contacts) > 1 else []
+    stuck = list(compress(several, frames.pool.map(is_stuck, several)))
     moves = np.zeros(poses.shape[1], dtype=np.bool_)
     for pair in stuck:
         # Any weights show which codes move the corners.

@@ -193,7 +193,7 @@ def test_no_rig_morph_or_clip_comes_out_worse(
 
 def test_a_correction_that_jerks_is_left_out_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
     body, motion = swinging()
-    motion = motion.part(range(6, 18))
+    motion = motion.part(range(10, 18))
     assert resolve_motion(body.resolver, motion, body.up).after.all()
     # As if the swing itself were a jerk.
     limits = sys.modules["lcollision_core.motion.resolve_motion"]
