@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 import shiboken6
-from PySide6.QtCore import QEvent, QObject, QPointF, Qt, QTimer, Signal, Slot
+from PySide6.QtCore import (
+    QEvent,
+    QObject,
+    QPoint,
+    QPointF,
+    QRect,
+    QSize,
+    Qt,
+    QTimer,
+    Signal,
+    Slot,
+)
 from PySide6.QtGui import (
     QContextMenuEvent,
     QKeyEvent,
@@ -221,6 +232,21 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
         super().initializeGL()
         context = self.context()
         context.aboutToBeDestroyed.connect(partial(shiboken6.invalidate, context.surface()))
+
+    @property
+    def _pixels(self) -> QSize:
+        """The size of Qt's framebuffer; Qt rounds halves up, pyvistaqt to even numbers."""
+        ratio: float = self.devicePixelRatioF()
+        return QSize(self.width(), self.height()) * ratio
+
+    def resizeGL(self, width: int, height: int) -> None:  # noqa: N802 - Qt's name
+        """Fill Qt's framebuffer: at fractional scales, a row would stay black."""
+        super().resizeGL(width, height)
+        if not self._shut:
+            self._vtk_interactor.UpdateSize(*self._pixels.toTuple())
+
+    def _blit(self, framebuffer: int, _: QRect) -> None:
+        super()._blit(framebuffer, QRect(QPoint(0, 0), self._pixels))
 
     def paintGL(self) -> None:  # noqa: N802 - Qt's name
         """Update the scene and draw it."""
