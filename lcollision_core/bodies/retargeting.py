@@ -68,6 +68,9 @@ _SHORT, _SHORT_BONE = 1e-9, 0.02
 _MOST_ALIKE, _UPRIGHT = 0.8, 0.9
 """Least share of equally aligned bones for equal rigs; and least cosine of an upright trunk."""
 
+_NEARLY = 0.2
+"""Share of the length of the legs by which a skeleton's feet may miss the ground."""
+
 
 @dataclass(frozen=True, eq=False)
 class Retargeting:
@@ -224,12 +227,26 @@ class Retargeting:
             return joint_rest
         rest = rest_places(self.motion)
         up = self.frame.T @ self.space.up
-        if rest[0] @ up <= 0.0:
+        if rest[0] @ up <= 0.0 or self._is_beside_ground(rest @ up):
             # The root has no position of its own: let the skeleton stand on the ground.
             ends = rest + np.nan_to_num(self.motion.ends)
             rest = rest - (ends @ up).min() * up
         place: FloatArray = rest[joint]
         return place
+
+    def _is_beside_ground(self, heights: FloatArray) -> bool:
+        """Whether the frames of a BVH file reach the ground, not the level of its rest pose.
+
+        The root's offset may be any place, as its positions replace it.
+
+        Parameters
+        ----------
+        heights : (J,) heights of the joints at rest
+        """
+        leg = _leg_length(self.space.rig, self.space.roles) / self.scale
+        lowest = float((in_world(self.motion)[1] @ self.frame.T @ self.space.up).min())
+        is_near = abs(lowest) + _NEARLY * leg < abs(lowest - float(heights.min()))
+        return self.motion.axes is None and is_near
 
 
 def _followed(

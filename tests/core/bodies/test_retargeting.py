@@ -139,6 +139,20 @@ def test_limbs_point_as_those_of_another_skeleton_do(tmp_path: Path) -> None:
     np.testing.assert_allclose((hips[1:] - hips[:-1]) * 35.7, [np.multiply([3, 1, 2], 0.8)] * 3)
 
 
+@pytest.mark.parametrize("height", [8.0, 300.0])
+def test_a_body_stands_on_the_ground_wherever_the_root_of_the_capture_rests(
+    tmp_path: Path, height: float
+) -> None:
+    body, path = RigBody.of(rigged_body()), tmp_path / "capture.bvh"
+    turns = np.broadcast_to(np.eye(3), (2, len(FOREIGN), 3, 3))
+    foreign(path, turns, np.array([[0.0, 38.7, 0.0], [0.0, 38.7, 9.0]]))
+    (plain,) = read_motions(body, path)
+    text = path.read_text()
+    path.write_text(text.replace("OFFSET 0.000000 0.000000", f"OFFSET 0.000000 {height}", 1))
+    (other,) = read_motions(body, path)
+    np.testing.assert_allclose(other.codes, plain.codes, atol=1e-6)
+
+
 def test_what_was_resolved_goes_back_into_the_file_and_all_else_stays(tmp_path: Path) -> None:
     body, motion = swinging()
     path, out = tmp_path / "swing.bvh", tmp_path / "free.bvh"
