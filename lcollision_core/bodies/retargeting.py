@@ -69,7 +69,7 @@ _MOST_ALIKE, _UPRIGHT = 0.8, 0.9
 """Least share of equally aligned bones for equal rigs; and least cosine of an upright trunk."""
 
 _NEARLY = 0.2
-"""Share of the length of the legs by which a skeleton's feet may miss the ground."""
+"""Share of the length of the legs that decides between two places on the ground."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,9 @@ class Retargeting:
                 for joint, own in enumerate(partner)
             ]
         )
-        return cls(motion, space, partner, frame, aligned, share, scale, same is not None)
+        # A VRM animation has the T pose of its own body, on the ground.
+        is_same = same is not None and path.suffix.lower() != VRMA_SUFFIX
+        return cls(motion, space, partner, frame, aligned, share, scale, is_same)
 
     @property
     def _hips(self) -> int:
@@ -175,7 +177,7 @@ class Retargeting:
                     turned = turns[:, above] @ from_rotation_vectors(part)
                 moved[:, joint] = self.frame @ turned @ self.frame.T @ self.aligned[joint]
             if joint == self._hips:
-                way = (places[:, partner] - self._rest_of(partner)) @ self.frame.T
+                way = (places[:, partner] - self._rest_of(partner, places)) @ self.frame.T
                 origins[:, joint] = rig.rest[joint, :3, 3] + self.scale * way
         transforms = np.broadcast_to(np.eye(4), (n_frames, n_joints, 4, 4)).copy()
         transforms[..., :3, :3] = moved @ rig.rest[:, :3, :3]
@@ -218,8 +220,13 @@ class Retargeting:
             roots += (after - before)[:, self._hips, :3, 3] @ self.frame / self.scale
         return self.motion.turns_as_stored(local), roots
 
-    def _rest_of(self, joint: int) -> FloatArray:
-        """Return the position of a skeleton joint when the character is at rest."""
+    def _rest_of(self, joint: int, places: FloatArray) -> FloatArray:
+        """Return the position of a skeleton joint when the character is at rest.
+
+        Parameters
+        ----------
+        places : (T, J, 3) positions of the joints in the frames
+        """
         if self.is_same_rig:
             joint_rest: FloatArray = (
                 self.space.rig.rest[self._hips, :3, 3] @ self.frame / self.scale
@@ -227,26 +234,29 @@ class Retargeting:
             return joint_rest
         rest = rest_places(self.motion)
         up = self.frame.T @ self.space.up
-        if rest[0] @ up <= 0.0 or self._is_beside_ground(rest @ up):
-            # The root has no position of its own: let the skeleton stand on the ground.
+        if self._begins_on_ground(rest @ up, float((places @ up).min())):
             ends = rest + np.nan_to_num(self.motion.ends)
             rest = rest - (ends @ up).min() * up
         place: FloatArray = rest[joint]
         return place
 
-    def _is_beside_ground(self, heights: FloatArray) -> bool:
-        """Whether the frames of a BVH file reach the ground, not the level of its rest pose.
+    def _begins_on_ground(self, heights: FloatArray, lowest: float) -> bool:
+        """Whether the skeleton stands on the ground when at rest, wherever its file places it.
 
-        The root's offset may be any place, as its positions replace it.
+        The frames show which: their lowest joint is near the ground, or as low as at rest. In
+        doubt, a root stored in the ground has no position of its own. In a BVH file a root may be
+        stored anywhere, as the positions of the frames replace that.
 
         Parameters
         ----------
-        heights : (J,) heights of the joints at rest
+        heights : (J,) heights of the joints as stored at rest
+        lowest : height of the lowest joint in the frames
         """
         leg = _leg_length(self.space.rig, self.space.roles) / self.scale
-        lowest = float((in_world(self.motion)[1] @ self.frame.T @ self.space.up).min())
-        is_near = abs(lowest) + _NEARLY * leg < abs(lowest - float(heights.min()))
-        return self.motion.axes is None and is_near
+        nearer = abs(lowest - float(heights.min())) - abs(lowest)
+        if heights[0] <= 0.0:
+            return nearer > -_NEARLY * leg
+        return self.motion.axes is None and nearer > _NEARLY * leg
 
 
 def _followed(

@@ -153,6 +153,16 @@ def test_a_body_stands_on_the_ground_wherever_the_root_of_the_capture_rests(
     np.testing.assert_allclose(other.codes, plain.codes, atol=1e-6)
 
 
+def test_a_capture_in_place_or_about_its_hips_stands_as_the_body_does(tmp_path: Path) -> None:
+    body, path = RigBody.of(rigged_body()), tmp_path / "capture.bvh"
+    turns = np.broadcast_to(np.eye(3), (2, len(FOREIGN), 3, 3))
+    bvh = foreign(path, turns, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 9.0]]))
+    hips = Retargeting.of(bvh.motion, body.space, path).transforms()[:, 0, :3, 3] @ TO_Y_UP.T
+    at_rest = body.space.rig.rest[0, :3, 3] @ TO_Y_UP.T
+    np.testing.assert_allclose(hips[0], at_rest, atol=1e-6)
+    np.testing.assert_allclose((hips[1] - hips[0]) * 35.7, [0.0, 0.0, 9.0 * 0.8], atol=1e-6)
+
+
 def test_what_was_resolved_goes_back_into_the_file_and_all_else_stays(tmp_path: Path) -> None:
     body, motion = swinging()
     path, out = tmp_path / "swing.bvh", tmp_path / "free.bvh"

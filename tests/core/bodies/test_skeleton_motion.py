@@ -211,6 +211,28 @@ def test_a_vrm_animation_begins_in_a_t_pose_and_points_limbs_as_the_motion_does(
     assert np.abs(body.decode(back.codes) - body.decode(codes)).max() < 1e-4 * body.body_size
 
 
+def vrm_name(_: int, name: str) -> str:
+    """Return the name of a person's joint among VRM's bones."""
+    side, _, kind = name.rpartition(" ")
+    bones = {"forearm": "lowerArm", "upperarm": "upperArm", "thigh": "upperLeg", "shin": "lowerLeg"}
+    bone = bones.get(kind, kind)
+    return {"L": "left", "R": "right"}[side] + bone[0].upper() + bone[1:] if side else bone
+
+
+@pytest.mark.parametrize("suffix", [".bvh", ".vrma"])
+@pytest.mark.parametrize("height", [-1.0, 2.0])
+def test_a_motion_comes_back_to_a_body_whose_origin_is_not_at_its_feet(
+    tmp_path: Path, suffix: str, height: float
+) -> None:
+    joints = {name: (above, (x, y + height, z)) for name, (above, (x, y, z)) in PERSON.items()}
+    body, path = RigBody.of(character_from(joints, vrm_name)), tmp_path / f"moves{suffix}"
+    codes = 0.3 * moving(body)
+    codes[:, :3] = 0.0
+    written(body, codes, path)
+    (back,) = read_motions(body, path)
+    assert np.abs(body.decode(back.codes) - body.decode(codes)).max() < 1e-4 * body.body_size
+
+
 def test_a_body_without_the_bones_of_vrm_is_refused_before_anything_is_written(
     tmp_path: Path,
 ) -> None:
