@@ -547,6 +547,11 @@ class _Source:
                 node |= {part: track[0].tolist() for part, track in zip(PARTS, tracks, strict=True)}
         for number, values in self._reweighed(weights).items():
             self.patch.add_channel(animation, times, number, "weights", values.reshape(-1, 1))
+        still = [number for number in rig.nodes.tolist() if "matrix" not in self._nodes[number]]
+        if still and not animation["channels"]:
+            # A clip needs at least one channel.
+            moved = np.tile(stored_parts(self._nodes[still[0]])[0], (len(transforms), 1))
+            self.patch.add_channel(animation, times, still[0], "translation", moved)
         if animation["channels"]:
             self.patch.description.setdefault("animations", []).insert(place, animation)
 

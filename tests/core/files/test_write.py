@@ -124,6 +124,16 @@ def test_poses_as_a_clip_come_before_those_that_are_kept(
     assert np.abs(after - before).max() < 1e-6 * size
 
 
+def test_a_clip_that_stands_still_is_as_long_as_its_frames(
+    character: Character, tmp_path: Path
+) -> None:
+    assert character.rig is not None
+    path, still = tmp_path / "still.glb", np.tile(character.rig.rest, (4, 1, 1, 1))
+    clip = NewClip("still", 10.0, still, [character.rest_vertices] * 4)
+    write_character_clips(path, character, [clip], lambda *_: None)
+    assert read_character(path).clips["still"] == pytest.approx(0.3)
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_readers_get_the_vertices_that_were_asked_for(
     form: CharacterForm, character: Character, tmp_path: Path
