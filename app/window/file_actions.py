@@ -244,7 +244,8 @@ class FileActions(QObject):
             raise LCollisionError(
                 f"isn't supported ({path.name})",
                 f"open poses ({POSES_SUFFIX}), a character or a mesh "
-                f"({', '.join(dict.fromkeys(meshes))}) or a model ({MODEL_SUFFIX})",
+                f"({', '.join(dict.fromkeys(meshes))}), a motion ({', '.join(SKELETON_SUFFIXES)}) "
+                f"or a model ({MODEL_SUFFIX})",
                 where=_kind(path),
             )
 
