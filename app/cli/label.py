@@ -23,7 +23,12 @@ from app.cli.console import (
 from app.cli.contacts import excluded_at_rest, note_rules
 from app.cli.evaluate import open_store
 from app.cli.models import measured_model, measured_model_sentence
-from app.cli.options import DeviceOption, ModelArgument, ThreadsOption
+from app.cli.options import (
+    DeviceOption,
+    ModelArgument,
+    ThreadsOption,
+    require_one_workplace,
+)
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError, listed
 from lcollision_core.options import SampleDistribution
@@ -85,10 +90,7 @@ def label(
     from lcollision_core.bodies import LearnedBody
     from lcollision_core.labels import LabelStore, label_poses
 
-    if workers is not None and scheduler is not None:
-        raise LCollisionError(
-            "--workers and --scheduler can't be used together", "the cluster has its own workers"
-        )
+    require_one_workplace(workers, scheduler)
     if device is Device.CUDA and scheduler is not None:
         raise LCollisionError(
             "--device cuda and --scheduler can't be used together", "the cluster has its own"

@@ -259,6 +259,18 @@ InPlaceOption = Annotated[
 ]
 
 
+def require_one_workplace(workers: int | None, scheduler: str | None) -> None:
+    """Raise if both threads of this machine and a cluster are asked for.
+
+    Raises
+    ------
+    LCollisionError : they are.
+    """
+    if workers is not None and scheduler is not None:
+        what = "--workers and --scheduler can't be used together"
+        raise LCollisionError(what, "the cluster has its own workers")
+
+
 def touch_entries(touch: list[str] | None, clearance: float) -> tuple[str, ...]:
     """Return the entries of --touch.
 

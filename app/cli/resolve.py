@@ -33,6 +33,7 @@ from app.cli.options import (
     ThreadsOption,
     TouchOption,
     refuse_given,
+    require_one_workplace,
     takes_options,
     touch_entries,
 )
@@ -205,10 +206,7 @@ def resolve(
     if sequence:
         note("--sequence is deprecated and means --motion; use that")
     motion = motion or sequence or (bool(inputs) and all(map(holds_motion, inputs or ())))
-    if scheduler is not None and workers is not None:
-        raise LCollisionError(
-            "--workers and --scheduler can't be used together", "the cluster has its own workers"
-        )
+    require_one_workplace(workers, scheduler)
     if motion:
         refuse_given(
             context, _OF_POSES, "is for poses, not for motions", "leave it or --motion out"

@@ -36,18 +36,20 @@ _MIRRORED = " mirrored"
 
 def overlap_text(energy: float) -> str:
     """Format a normalised energy as its equivalent depth, as in "1.1 %"."""
-    return "none" if energy == 0.0 else height_text(math.sqrt(energy))
+    return say("none") if energy == 0.0 else height_text(math.sqrt(energy))
 
 
 def height_text(distance: float, digits: int = 1) -> str:
     """Format a normalised distance as a share of the body size, as in "1.1 %" or "below 0.1 %"."""
     percent, least = 100.0 * distance, 10.0**-digits
-    return f"below {least:g} %" if 0.0 < percent < least / 2 else f"{percent:.{digits}f} %"
+    if 0.0 < percent < least / 2:
+        return say("below {least:g} %", least=least)
+    return f"{percent:.{digits}f} %"
 
 
 def share_text(distance: float) -> str:
     """Format a normalised, possibly small distance, as in "0.108 % of the body size"."""
-    return f"{100.0 * distance:.3g} % of the body size"
+    return say("{percent:.3g} % of the body size", percent=100.0 * distance)
 
 
 def length_text(distance: float, millimetres: float | None) -> str:
@@ -213,15 +215,15 @@ def duration_text(seconds: float) -> str:
     """Format a remaining time as in "about 25 minutes", in plausible precision."""
     minutes = seconds / 60.0
     if minutes < 0.75:
-        return "less than a minute"
-    if minutes < 1.5:
-        return "about 1 minute"
+        return say("less than a minute")
     step = 1 if minutes < 20 else 5
     whole = step * round(minutes / step)
     if whole < 60:
-        return f"about {whole} minutes"
+        return say_number(whole, "about {n} minute", "about {n} minutes")
     hours, rest = divmod(whole, 60)
-    return f"about {hours} h {rest} min" if rest else f"about {hours} h"
+    if rest:
+        return say("about {hours} h {minutes} min", hours=hours, minutes=rest)
+    return say("about {hours} h", hours=hours)
 
 
 def spent_text(seconds: float) -> str:
@@ -232,15 +234,15 @@ def spent_text(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min"
 
 
-def frames_text(frames: Sequence[int]) -> str:
-    """List frame numbers, at most ten."""
+def frames_text(frames: Sequence[object]) -> str:
+    """List frames, by number or in pairs, at most ten."""
     return ", ".join(map(str, frames[:10])) + (" ..." if len(frames) > 10 else "")
 
 
 def between_text(frames: Sequence[int]) -> str:
     """Describe contacts between frames, by the frames before and after."""
-    listed = ", ".join(say("{at} and {after}", at=at, after=at + 1) for at in frames[:10])
-    return say("contact between frames {frames}", frames=listed + " ..." * (len(frames) > 10))
+    pairs = [say("{at} and {after}", at=at, after=at + 1) for at in frames]
+    return say("contact between frames {frames}", frames=frames_text(pairs))
 
 
 _NAMED_PARTS = 4
