@@ -92,7 +92,7 @@ def _require_cuda() -> None:
 
 @cache
 def _has_extra() -> bool:
-    return find_spec("numba_cuda") is not None or _is_simulated()
+    return find_spec("numba_cuda") is not None or os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"
 
 
 @cache
@@ -100,7 +100,3 @@ def _has_gpu() -> bool:
     from lcollision_core.on_gpu import cuda
 
     return bool(cuda.is_available())
-
-
-def _is_simulated() -> bool:
-    return os.environ.get("NUMBA_ENABLE_CUDASIM", "0") == "1"

@@ -20,7 +20,6 @@ from lcollision_core.bodies.names import (
     code_effects,
     domain_colours,
     names_from_labels,
-    numbered_names,
 )
 from lcollision_core.bundled import bundled_folder, user_folder
 from lcollision_core.embedding.bilevel import BOX_ARRAYS, Embedding, LatentFit
@@ -352,7 +351,7 @@ class LearnedBody(Body):
         reference = pose_set.vertices[0]
         up = pose_set.up.axis
         if pose_set.vertex_labels is None:
-            names = numbered_names(embedding.n_domains)
+            names = tuple(f"part {domain + 1}" for domain in range(embedding.n_domains))
         else:
             names = names_from_labels(
                 embedding.attention_mask, pose_set.vertex_labels, reference[:, up]

@@ -29,11 +29,6 @@ _SAME_SHARE = 0.5
 """Ratio of the two sides' weights above which a domain belongs to both sides."""
 
 
-def numbered_names(n_domains: int) -> tuple[str, ...]:
-    """Return "part 1" to "part K"."""
-    return tuple(f"part {domain + 1}" for domain in range(n_domains))
-
-
 def names_from_labels(
     attention_mask: npt.NDArray[Any],
     vertex_labels: npt.NDArray[np.str_],

@@ -488,10 +488,8 @@ class SceneBody(Body):
             if not member.moves or member.is_fixed:
                 continue
             for pose in member.body.starter_poses:
-                codes, moves = (
-                    np.zeros(self.latent_size),
-                    np.zeros(self.latent_size, dtype=np.bool_),
-                )
+                codes = np.zeros(self.latent_size)
+                moves = np.zeros(self.latent_size, dtype=np.bool_)
                 codes[own] = pose.codes
                 moves[own] = True if pose.moves is None else pose.moves
                 name = self._in_body(member.name, pose.name)
@@ -693,9 +691,8 @@ class SceneBody(Body):
     def resolver(self) -> PoseResolver:
         """Resolves collisions within and between bodies."""
         bodies = self._alone.values() if self._own_rules_hold else ()
-        return SceneResolver(
-            self.exact_check(), self.free_latent, self.starting_poses, tuple(bodies)
-        )
+        check, starts = self.exact_check(), self.starting_poses
+        return SceneResolver(check, self.free_latent, starts, tuple(bodies))
 
     @property
     def _own_rules_hold(self) -> bool:

@@ -615,17 +615,30 @@ class _Resolution:
             known = [self.done[at] for at in self._own(window).tolist() if at in self.done]
             is_new = len(known) < len(window)
             # Frames that the next window corrects again count once.
-            progress = _ProgressShare(self, window.stop - reached)
+            report = self._report_of(window.stop - reached)
             if is_new:
-                known = self._solve_window(frames, window, span, progress.report)
+                known = self._solve_window(frames, window, span, report)
             for at, solved in zip(self._own(window).tolist(), known, strict=True):
                 self.codes[at], self.after[at] = solved
                 if self.keep is not None and is_new:
                     with self.lock:
                         self.keep(at, solved)
-            progress.report(1.0)
+            report(1.0)
             reached = window.stop
             self.solved[span] = reached - span.start
+
+    def _report_of(self, n_frames: int) -> Callable[[float], None]:
+        """Return the report of the share of some frames that is done, in [0, 1]; it never falls."""
+        reported = 0.0
+
+        def report(share: float) -> None:
+            nonlocal reported
+            with self.lock:
+                self.n_done += n_frames * max(0.0, share - reported)
+                reported = max(reported, share)
+                self.job.report(min(round(self.n_done), self.n_frames), self.n_frames)
+
+        return report
 
     def _solve_window(
         self, frames: Frames, window: range, span: range, tell: Callable[[float], None]
@@ -941,22 +954,6 @@ class _Solution(NamedTuple):
     freed: dict[int, FloatArray]
     is_good: bool
     worth: tuple[int, float, int, float]
-
-
-class _ProgressShare:
-    """Progress of some frames, as part of a resolution."""
-
-    def __init__(self, run: _Resolution, n_frames: int) -> None:
-        self._run, self._n_frames, self._told = run, n_frames, 0.0
-
-    def report(self, share: float) -> None:
-        """Report the share of the frames that is done, in [0, 1]; it never falls."""
-        run = self._run
-        with run.lock:
-            gain = self._n_frames * max(0.0, share - self._told)
-            self._told = max(self._told, share)
-            run.n_done += gain
-            run.job.report(min(round(run.n_done), run.n_frames), run.n_frames)
 
 
 def _contacts_of(motion: Motion, options: MotionOptions) -> KeptContacts | None:
