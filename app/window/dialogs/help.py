@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QDialogButtonBox, QFormLayout, QLabel, QMessageBox
 
 from app.view.theme import CLOSE, NORMAL, WIDE, program_icon
 from app.window.dialogs.questions import Dialog, message_box, widen
-from app.window.widgets import dialog_vbox, labelled, screen_of, scrolling
+from app.window.widgets import described, dialog_vbox, labelled, screen_of, scrolling
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body
@@ -129,7 +129,11 @@ class ShortcutsDialog(Dialog):
             form.addRow(labelled(""))
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         buttons.rejected.connect(self.reject)
-        self.setLayout(dialog_vbox(scrolling(page), buttons))
+        area = described(scrolling(page), "", "Keys and their effects")
+        self.setLayout(dialog_vbox(area, buttons))
+        # Without it, no key would scroll to the keys below.
+        area.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        area.setFocus()
 
 
 def _version() -> str:

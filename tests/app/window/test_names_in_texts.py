@@ -9,7 +9,7 @@ import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QAction, QColor, QKeySequence
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QApplication, QDialog, QLabel, QMenu, QWidget
+from PySide6.QtWidgets import QApplication, QDialog, QLabel, QMenu, QScrollArea, QWidget
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
@@ -128,6 +128,12 @@ def test_the_list_of_shortcuts_names_no_step(window: MainWindow) -> None:
     indents = {label.text(): label.indent() for label in dialog.findChildren(QLabel)}
     nested = words[words.index("Drag stiffness") :]
     assert nested[:4] == ["Drag stiffness", "", "Loose", window_key("Ctrl+Alt+7")]
+    # It scrolls without a mouse.
+    (area,) = dialog.findChildren(QScrollArea)
+    focused = dialog.focusWidget()
+    assert focused is not None
+    QTest.keyClick(focused, Qt.Key.Key_PageDown)
+    assert area.verticalScrollBar().value() > 0
     assert indents["Loose"] > indents["Drag stiffness"] == indents["Undo"]
     dialog.reject()
 
