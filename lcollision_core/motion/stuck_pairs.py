@@ -14,6 +14,9 @@ from lcollision_core.motion.frames import Frames
 DomainPair = tuple[int, int]
 """Two domains, the lower index first."""
 
+_MOST_PAIRS = 40
+"""Most pairs that are tried: each takes up to a second."""
+
 
 @dataclass
 class _Contact:
@@ -42,8 +45,8 @@ def stuck_pairs(
 
     Returns
     -------
-    pairs, codes : the pairs, none if only one pair collides, and (n,) the codes that move their
-        contacts
+    pairs, codes : the pairs, none if only one pair or too many collide, and (n,) the codes that
+        move their contacts
 
     Raises
     ------
@@ -68,8 +71,8 @@ def stuck_pairs(
         alone = replace(frames, resolver=frames.resolver.with_check(check))
         return alone.resolved(contacts[pair].deepest[1]) is None
 
-    several = list(contacts) if len(contacts) > 1 else []
-    stuck = list(compress(several, frames.pool.map(is_stuck, several)))
+    tried = list(contacts) if 1 < len(contacts) <= _MOST_PAIRS else []
+    stuck = list(compress(tried, frames.pool.map(is_stuck, tried)))
     moves = np.zeros(poses.shape[1], dtype=np.bool_)
     for pair in stuck:
         # Any weights show which codes move the corners.
