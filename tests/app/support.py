@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 from typer.testing import Result
 
 from app.editing.document import PoseDocument
+from app.work.threads import as_task
 from lcollision_core.bodies import ExportRequest
 from lcollision_core.tasks import exporting
 
@@ -43,7 +43,7 @@ def refusal(lcollision: Lcollision, *arguments: object) -> str:
 
 def export_pose(document: PoseDocument, path: Path, request: ExportRequest | None = None) -> None:
     """Write the pose on the screen, as the window does."""
-    work = partial(
+    work = as_task(
         exporting.export,
         document.model,
         document.history.pose,

@@ -747,7 +747,7 @@ def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
     assert state.moment is not None
     write = partial(exporting.export, own=state.moment.space)
     obj, asked = tmp_path / "frame.obj", ExportRequest()
-    write(model, state.pose, None, obj, asked, Job())
+    write(model, state.pose, None, obj, asked)
     np.testing.assert_allclose(read_mesh(obj).vertices, frames[2], atol=2e-6 * size)
     qtbot.waitUntil(lambda: len(timeline.onion_frames()) == 2)
     for by, skin in timeline.onion_frames():
