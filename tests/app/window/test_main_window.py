@@ -249,6 +249,7 @@ def test_a_message_outlives_the_pointer_s_way_over_a_button(window: MainWindow) 
     bar, action = window.statusBar(), window.actions_by_key["open"]
     (tool_bar,) = window.findChildren(QToolBar)
     button = tool_bar.widgetForAction(action)
+    QTest.mouseMove(window.viewport)
     QTest.mouseMove(button)
     assert bar.currentMessage() == action.statusTip()
     window.document.message.emit("All are free now")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from app.view.shading import Shading
@@ -170,7 +171,8 @@ def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: 
     (parts,) = [item for item in top if item is not None and "Leave out meshes" in item.text(0)]
     names = [parts.child(row).text(0) for row in range(parts.childCount())]
     assert {group.name for group in body.groups_by_kind["meshes and materials"]} == set(names)
-    # Several rows are visible, and more once the dialog is taller.
+    # Several rows are visible, and more once the dialog is taller. Pending layouts come first.
+    QApplication.processEvents()
     heights = [dialog.ignored.height()]
     dialog.resize(dialog.width(), dialog.height() + 100)
     heights.append(dialog.ignored.height())
