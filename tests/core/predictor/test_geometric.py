@@ -261,7 +261,8 @@ def test_inputs_are_the_same_with_derivatives_and_without(
         assert not ours.requires_grad
         assert theirs.requires_grad
         assert ours.abs().max() > 0.1
-        assert torch.allclose(ours, theirs, atol=2e-5)
+        # In single precision each is up to 2e-5 from double.
+        assert torch.allclose(ours, theirs, atol=4e-5)
 
 
 def test_a_batch_is_its_poses(tube_model: LearnedBody, network: GeometricNetwork) -> None:
