@@ -84,6 +84,8 @@ class ResolvedMotion:
     ground: GroundReport | None = None
 
 
+_BeginWithout = Callable[[Sequence[DomainPair], Sequence[int], Motion], "_Resolution"]
+
 Solved = tuple[FloatArray, bool]
 """The (D,) codes of a frame, and whether they are free."""
 
@@ -159,24 +161,24 @@ def resolve_motion(
 
         def begin(
             motion: Motion,
-            chosen: MotionOptions,
             job_of_check: Job,
             checking: Job = UNWATCHED,
+            options: MotionOptions = chosen,
             resolver: PoseResolver = resolver,
         ) -> _Resolution:
             is_cycle = motion.is_cycle
             frames = Frames(
                 motion.two_turns() if is_cycle else motion,
                 resolver,
-                replace(chosen.frame, largest_change=None),
+                replace(options.frame, largest_change=None),
                 pool,
                 job_of_check,
-                chosen.continuous,
-                largest_change=chosen.frame.largest_change,
-                kept_contacts=_contacts_of(motion, chosen),
+                options.continuous,
+                largest_change=options.frame.largest_change,
+                kept_contacts=_contacts_of(motion, options),
             )
             chosen_frames = range(len(motion)) if within is None else within
-            run = _Resolution.begin(motion, frames, chosen, chosen_frames, up, checking)
+            run = _Resolution.begin(motion, frames, options, chosen_frames, up, checking)
             # Finished frames are judged after a stop too.
             run.guard = replace(run.guard, frames=replace(frames, job=job.part()))
             run.frames, run.outer = replace(frames, job=watched), outer
@@ -190,17 +192,17 @@ def resolve_motion(
             check = resolver.check.without_pairs(domain_pairs)
             locks = chosen.frame.locked_codes.union(locked)
             options = replace(chosen, frame=replace(chosen.frame, locked_codes=locks))
-            rest = begin(motion, options, job.part(), resolver=resolver.with_check(check))
+            rest = begin(motion, job.part(), UNWATCHED, options, resolver.with_check(check))
             rest.job, rest.done, rest.keep, rest.begin_without = job.part(), {}, None, None
             return rest
 
-        run = begin(motion, chosen, watched, Job(checking))
+        run = begin(motion, watched, Job(checking))
         bodies = [body for body in resolver.bodies if not body.is_locked(chosen.frame)]
         is_plain = motion.placements is None and motion.hidden is None and motion.contacts is None
         if len(bodies) > 1 and is_plain and run.wanted.any():
             reports = _Reports(job, len(bodies) + 1)
             each, is_rough = _each_by_itself(run, bodies, up, workers, reports)
-            together = begin(each, chosen, job.part())
+            together = begin(each, job.part())
             # Where bodies meet, poses that contacts allow came back, and ended in jerks.
             together.cuts_off = True
             together.job = job.part(reports.of(len(bodies)))
@@ -349,9 +351,7 @@ class _Resolution:
     n_frames: int = 0
     n_done: float = 0.0
     cuts_off: bool = False
-    begin_without: Callable[[Sequence[DomainPair], Sequence[int], Motion], _Resolution] | None = (
-        None
-    )
+    begin_without: _BeginWithout | None = None
 
     @classmethod
     def begin(
@@ -832,8 +832,9 @@ class _Resolution:
         # First, lock what is stuck; move it too if that frees nothing.
         for locked in (held.tolist(), list[int]()):
             codes = self.begin_without(stuck, locked, current).result().motion.codes[: self.n]
-            spans = runs((codes != self.codes).any(axis=1))
-            if [span for span in spans if self._takes(span, codes[span.start : span.stop])]:
+            moved = runs((codes != self.codes).any(axis=1))
+            takes = [self._takes(span, codes[span.start : span.stop]) for span in moved]
+            if any(takes):
                 break
 
     def _takes(self, span: range, codes: FloatArray) -> bool:

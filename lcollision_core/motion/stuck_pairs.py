@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.motion.frames import Frames
+from lcollision_core.posing.exact import ContactRegions
 
 DomainPair = tuple[int, int]
 """Two domains, the lower index first."""
@@ -24,7 +25,7 @@ class _Contact:
 
     Attributes
     ----------
-    deepest : the largest depth, normalised, and its frame
+    deepest : the largest depth, see `ContactRegions`, and its frame
     corners : vertices of the colliding faces, in any frame
     """
 
@@ -56,15 +57,12 @@ def stuck_pairs(
     contacts: dict[DomainPair, _Contact] = {}
     overlaps = frames.pool.map(lambda at: frames.check(at).collisions(poses[at]), numbers)
     for frame, overlap in zip(numbers, overlaps, strict=True):
-        faces = space.topology.faces[overlap.pairs]
-        owners = np.sort(space.vertex_domain[faces[:, :, 0]])
-        pairs, of_row = np.unique(owners, axis=0, return_inverse=True)
-        for number, (one, other) in enumerate(pairs.tolist()):
-            is_of = of_row.ravel() == number
-            depth = float(overlap.penetration_depth[is_of].max())
-            contact = contacts.setdefault((one, other), _Contact((depth, frame)))
+        faces, regions = space.topology.faces[overlap.pairs], ContactRegions.of(space, overlap)
+        for region, name in enumerate(regions.names.tolist()):
+            depth = float(regions.depth[region])
+            contact = contacts.setdefault(divmod(name, space.n_domains), _Contact((depth, frame)))
             contact.deepest = max(contact.deepest, (depth, frame))
-            contact.corners.update(np.unique(faces[is_of]).tolist())
+            contact.corners.update(faces[regions.of_pair == region].ravel().tolist())
 
     def is_stuck(pair: DomainPair) -> bool:
         check = frames.resolver.check.without_pairs(contacts.keys() - {pair})
@@ -76,10 +74,8 @@ def stuck_pairs(
     moves = np.zeros(poses.shape[1], dtype=np.bool_)
     for pair in stuck:
         # Any weights show which codes move the corners.
-        weights, corners = (
-            np.zeros((1, space.topology.n_vertices, 3)),
-            sorted(contacts[pair].corners),
-        )
+        corners = sorted(contacts[pair].corners)
+        weights = np.zeros((1, space.topology.n_vertices, 3))
         weights[0, corners] = np.random.default_rng(0).normal(size=(len(corners), 3))
         frame = contacts[pair].deepest[1]
         moves |= frames.check(frame).space.pull_back(poses[frame], weights)[0] != 0.0
