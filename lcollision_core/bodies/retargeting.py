@@ -272,14 +272,13 @@ def _followed(
     figure = with_chosen_roles(stick_figure(motion, rest, motion.up), chosen_partners, space)
     anatomy = _facing(anatomy_of(figure), motion.front)
     partner = partners(motion, anatomy, space, chosen_partners)
-    unsure = unsure_joints(partner, figure, anatomy, space)
-    if chosen_partners:
+    unsure: frozenset[str] = frozenset()
+    if not chosen_partners:
+        unsure = unsure_joints(partner, figure, anatomy, space)
+    elif len(followed_limbs(partner, space)) < LEAST_JOINTS:
         # Choices that are too few to move the limbs are asked for again.
-        asks = len(followed_limbs(partner, space)) < LEAST_JOINTS
         kinds = zip(space.rig.joint_names, space.roles, partner, strict=True)
-        unsure = frozenset(
-            name for name, role, other in kinds if asks and role in ALIGNED and other < 0
-        )
+        unsure = frozenset(name for name, role, other in kinds if role in ALIGNED and other < 0)
     return figure, anatomy, partner, unsure
 
 
