@@ -249,7 +249,7 @@ def test_a_message_outlives_the_pointer_s_way_over_a_button(window: MainWindow) 
     bar, tip = window.statusBar(), window.actions_by_key["open"].statusTip()
 
     def point_at(tip: str) -> None:
-        """Ask for a tip as Qt does when the pointer comes upon a button, or for "" as it leaves."""
+        """Send what Qt sends when the pointer enters a button; "" is sent when it leaves one."""
         QApplication.sendEvent(window, QStatusTipEvent(tip))
 
     point_at(tip)

@@ -47,6 +47,15 @@ def test_long_names_leave_room_for_all_columns(window: MainWindow) -> None:
     dialog.close()
 
 
+def asked_about(qtbot: QtBot, window: MainWindow, swing: Path, folder: Path) -> JointsDialog:
+    """Drop the swing with two joints renamed, and return the page that asks about them."""
+    path = renamed(swing, folder / "unsure.glb", {"LeftArm": "bone 7", "LeftForeArm": "bone 8"})
+    with qtbot.waitSignal(window.document.timeline.joints_unsure, timeout=PATIENCE):
+        drop(window, path)
+    (dialog,) = shown_dialogs(window)
+    return dialog
+
+
 @pytest.mark.slow
 def test_what_is_unsure_is_asked_once_and_remembered(
     qtbot: QtBot,
@@ -65,10 +74,7 @@ def test_what_is_unsure_is_asked_once_and_remembered(
     assert timeline.joints is not None
     assert not timeline.joints.unsure
     assert not shown_dialogs(window)
-    path = renamed(swing, tmp_path / "unsure.glb", {"LeftArm": "bone 7", "LeftForeArm": "bone 8"})
-    with qtbot.waitSignal(timeline.joints_unsure, timeout=PATIENCE):
-        drop(window, path)
-    (dialog,) = shown_dialogs(window)
+    dialog = asked_about(qtbot, window, swing, tmp_path)
     assert timeline.joints.unsure == {"LeftArm", "LeftForeArm"}
     assert dialog.choices["LeftArm"].currentData() == "bone 7"
     assert list(dialog.choices)[:2] == ["LeftArm", "LeftForeArm"]
@@ -102,10 +108,7 @@ def test_too_few_chosen_joints_are_asked_for_again(
     document, timeline = window.document, window.document.timeline
     with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         drop(window, swing)
-    path = renamed(swing, tmp_path / "unsure.glb", {"LeftArm": "bone 7", "LeftForeArm": "bone 8"})
-    with qtbot.waitSignal(timeline.joints_unsure, timeout=PATIENCE):
-        drop(window, path)
-    (dialog,) = shown_dialogs(window)
+    dialog = asked_about(qtbot, window, swing, tmp_path)
     before, limbs = timeline.motion, ("LeftArm", "RightArm", "LeftLeg")
     for joint in limbs:
         dialog.choices[joint].setCurrentIndex(0)
