@@ -33,6 +33,10 @@ as when all codes that could change them are locked or pinned."""
 _TOLERANCE, _MOST_ITERATIONS, _PATIENCE = 1e-8, 2000, 3
 """Tolerance of a half-space, most iterations, and most successive ones without progress."""
 
+_ADDED = 150
+"""Half-spaces that a program begins with, those of least slack, and most violated ones that are
+added to its active ones until none is violated: of thousands, few are active."""
+
 
 @dataclass(frozen=True, eq=False)
 class HalfSpaces:
@@ -150,36 +154,68 @@ def least_corrections(
     n_equal = int(np.count_nonzero(counts[: len(shares) - len(constraints.offsets)]))
     along, across = along[counts], across[counts]
     shares, normals, offsets = shares[counts], normals[counts], offsets[counts]
-    gram = (along @ shares.T) * (across @ normals.T)
-    scale = 1.0 / np.sqrt(np.diag(gram))
-    at_mean = np.einsum("mt,td,md->m", shares, kernel.mean, normals, optimize=True)
-    bounds = (offsets - at_mean) * scale
-    gram *= np.outer(scale, scale)
-    gram[np.diag_indices_from(gram)] += np.broadcast_to(both.softness, len(counts))[counts]
+    softness = np.broadcast_to(both.softness, len(counts))[counts]
+    scale: FloatArray = 1.0 / np.sqrt(reach[counts])
+
+    def slack(corrections: FloatArray) -> FloatArray:
+        at: FloatArray = (offsets - ((shares @ corrections) * normals).sum(axis=1)) * scale
+        return at
+
+    slack_at_mean = slack(kernel.mean)
+    active = np.arange(n_equal)
+    added = n_equal + np.argsort(slack_at_mean[n_equal:], kind="stable")[:_ADDED]
+    while True:
+        rows = np.concatenate([active, added])
+        gram = (along[rows] @ shares[rows].T) * (across[rows] @ normals[rows].T)
+        gram *= np.outer(scale[rows], scale[rows])
+        gram[np.diag_indices_from(gram)] += softness[rows]
+        presses = slack_at_mean[rows] < 0.0
+        presses[: len(active)] = True
+        multipliers = _solve_program(gram, slack_at_mean[rows], presses, n_equal)
+        if multipliers is None:
+            return None
+        pressed = scale[rows] * multipliers
+        moved: FloatArray = kernel.mean - (along[rows] * pressed[:, None]).T @ across[rows]
+        left = slack(moved)
+        left[rows] = 0.0
+        if (left >= -_TOLERANCE).all():
+            return moved
+        active = np.concatenate([active[:n_equal], rows[n_equal:][multipliers[n_equal:] > 0.0]])
+        worst = np.argsort(left, kind="stable")[:_ADDED]
+        added = worst[left[worst] < -_TOLERANCE]
+
+
+def _solve_program(
+    gram: FloatArray, slack: FloatArray, presses: npt.NDArray[np.bool_], n_equal: int
+) -> FloatArray | None:
+    """Return the (M,) multipliers of equations, which come first, and half-spaces, or None."""
     equal, rest = slice(n_equal), slice(n_equal, None)
     # Eliminate the equations, which leaves a program of the half-spaces.
-    solved = np.zeros((n_equal, 1 + len(bounds) - n_equal))
+    solved = np.zeros((n_equal, 1 + len(slack) - n_equal))
     if n_equal:
-        known = np.column_stack([bounds[equal], gram[equal, rest]])
+        known = np.column_stack([slack[equal], gram[equal, rest]])
         solved = scipy.linalg.cho_solve(scipy.linalg.cho_factor(gram[equal, equal]), known)
     mixed = gram[rest, equal]
     multipliers = _solve_lcp(
-        gram[rest, rest] - mixed @ solved[:, 1:], bounds[rest] - mixed @ solved[:, 0]
+        gram[rest, rest] - mixed @ solved[:, 1:],
+        slack[rest] - mixed @ solved[:, 0],
+        presses[rest],
     )
     if multipliers is None:
         return None
-    pressed = scale * np.concatenate([-solved[:, 0] - solved[:, 1:] @ multipliers, multipliers])
-    moved: FloatArray = kernel.mean - (along * pressed[:, None]).T @ across
-    return moved
+    return np.concatenate([-solved[:, 0] - solved[:, 1:] @ multipliers, multipliers])
 
 
-def _solve_lcp(gram: FloatArray, bounds: FloatArray) -> FloatArray | None:
+def _solve_lcp(
+    gram: FloatArray, slack: FloatArray, presses: npt.NDArray[np.bool_]
+) -> FloatArray | None:
     """Return the multipliers >= 0 of (M,) half-spaces, None if the solver fails.
 
     Parameters
     ----------
     gram : (M, M) dual Hessian, definite
-    bounds : (M,) slack of each half-space at 0
+    slack : (M,) of each half-space at 0
+    presses : (M,) half-spaces that are taken as active at first
 
     Notes
     -----
@@ -187,16 +223,16 @@ def _solve_lcp(gram: FloatArray, bounds: FloatArray) -> FloatArray | None:
     large-scale strictly monotone linear complementarity problems", 1994. All half-spaces on the
     wrong side change sides at once, or only one if that makes no progress.
     """
-    presses, least, patience = bounds < 0.0, len(bounds) + 1, _PATIENCE
+    presses, least, patience = presses.copy(), len(slack) + 1, _PATIENCE
     for _ in range(_MOST_ITERATIONS):
         pressing = np.flatnonzero(presses)
-        multipliers = np.zeros(len(bounds))
+        multipliers = np.zeros(len(slack))
         if len(pressing):
             factor = scipy.linalg.cho_factor(
                 gram[np.ix_(pressing, pressing)], lower=True, overwrite_a=True
             )
-            multipliers[pressing] = scipy.linalg.cho_solve(factor, -bounds[pressing])
-        left = bounds + gram[:, pressing] @ multipliers[pressing]
+            multipliers[pressing] = scipy.linalg.cho_solve(factor, -slack[pressing])
+        left = slack + gram[:, pressing] @ multipliers[pressing]
         is_wrong = np.where(presses, multipliers < 0.0, left < -_TOLERANCE)
         n_wrong = int(np.count_nonzero(is_wrong))
         if n_wrong == 0:

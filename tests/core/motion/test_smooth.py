@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from lcollision_core.motion import span_program
 from lcollision_core.motion.span_program import (
     SOFTNESS,
     HalfSpaces,
@@ -104,13 +105,37 @@ def test_many_contacts_that_contradict_each_other_hold_as_far_as_they_yield() ->
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         gram = normals @ normals.T + SOFTNESS * np.eye(n_contacts)
         bounds = generator.normal(size=n_contacts)
-        multipliers = _solve_lcp(gram, bounds)
+        multipliers = _solve_lcp(gram, bounds, bounds < 0.0)
         assert multipliers is not None
         left = bounds + gram @ multipliers
         assert multipliers.min() == 0.0
         assert left.min() > -1e-6
         assert np.abs(left[multipliers > 0.0]).max() < 1e-6
         assert np.count_nonzero(multipliers) > 1
+
+
+@pytest.mark.parametrize("n_equal", [0, 4])
+def test_of_many_contacts_those_that_are_added_step_by_step_give_the_same(
+    metric: FloatArray, n_equal: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generator = np.random.default_rng(11)
+    still = np.zeros((2, SIZE))
+    kernel = TimeKernel.of(N, WEIGHT, still, still, {}, SIZE)
+
+    def drawn(n_rows: int) -> HalfSpaces:
+        shares = np.eye(N)[generator.integers(N, size=n_rows)]
+        normals = generator.normal(size=(n_rows, SIZE))
+        return HalfSpaces(shares, normals, generator.normal(0.5, 0.5, size=n_rows))
+
+    rows, equations = drawn(400), drawn(n_equal)
+    corrections = []
+    for n_added in (400, 20):
+        monkeypatch.setattr(span_program, "_ADDED", n_added)
+        solution = least_corrections(kernel, np.linalg.inv(metric), rows, equations)
+        assert solution is not None
+        corrections.append(solution)
+    assert np.abs(corrections[0]).max() > 0.1
+    np.testing.assert_allclose(corrections[1], corrections[0], rtol=0.0, atol=1e-8)
 
 
 def test_locked_codes_do_not_move(metric: FloatArray) -> None:
