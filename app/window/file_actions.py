@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from PySide6.QtCore import QObject, Qt, QTimer, Signal, Slot
 from PySide6.QtWidgets import QDialog, QFileDialog, QWidget
@@ -34,6 +34,7 @@ from app.window.dialogs.questions import (
     ask_to_replace_files,
     ask_to_switch,
     ask_to_turn,
+    wait_for_exports,
 )
 from app.window.widgets import ListMenu, plain_tip
 from app.work.threads import as_task
@@ -89,6 +90,15 @@ def _kinds(*wanted: str) -> str:
 def _kind(path: Path) -> str:
     """Return the name of a file's format, taken from its extension, such as "FBX"."""
     return path.suffix.removeprefix(".").upper() or "A file without an extension"
+
+
+class _Carried(NamedTuple):
+    """What a body or a scene keeps when it is opened again with more or fewer bodies."""
+
+    body: Body
+    pose: NamedPose | None
+    locked_domains: frozenset[int]
+    removed: str
 
 
 class FileActions(QObject):
@@ -147,7 +157,7 @@ class FileActions(QObject):
         document.tasks.wrong_scale.connect(self._offer_scale, Qt.ConnectionType.QueuedConnection)
         self._dropped: tuple[Path, int] | None = None
         self._last_message = ""
-        self._pose_to_restore: tuple[NamedPose, Body, str] | None = None
+        self._carried: _Carried | None = None
 
     def ask_and_open(self, title: str, *kinds: str) -> None:
         """Ask for a file of some kinds and open it; see `_kinds`."""
@@ -209,7 +219,7 @@ class FileActions(QObject):
         from lcollision_core.files.motion.generated import is_generated
         from lcollision_core.files.motion.smpl import is_smpl_motion
 
-        self._dropped = self._pose_to_restore = None
+        self._dropped = self._carried = None
         suffix = path.suffix.lower()
         if is_learned_from(path):
             self.learning_wanted.emit((path,))
@@ -329,9 +339,13 @@ class FileActions(QObject):
         history = self._document.history
         if self._confirm_losing_motions() and self._may_lose_library():
             file = changed(history.model, str(history.model.own_file or history.model_file))
-            if history.state.moment is None and history.latent.any():
-                self._pose_to_restore = history.pose, history.model, removed
+            is_posed = history.state.moment is None and history.latent.any()
+            self._carry(history.pose if is_posed else None, removed)
             self._document.tasks.open_model(file)
+
+    def _carry(self, pose: NamedPose | None, removed: str = "") -> None:
+        document = self._document
+        self._carried = _Carried(document.model, pose, document.motion.locked_domains, removed)
 
     def play_clip(self, name: str, clip: str, start: float) -> None:
         """Let a body of the scene play a clip that starts after `start` seconds."""
@@ -354,7 +368,7 @@ class FileActions(QObject):
         history = self._document.history
         if self._confirm_losing_motions() and self._may_lose_library():
             file = str(history.model.own_file or history.model_file)
-            self._pose_to_restore = history.pose, history.model, ""
+            self._carry(history.pose)
             self._document.tasks.open_model(with_ground(history.model, file))
 
     def save_scene(self) -> None:
@@ -645,8 +659,15 @@ class FileActions(QObject):
         if document.has_model and not document.timeline.are_saved():
             changed = [now.name for _, now in document.timeline.changes]
             answer = ask_about_motions(self._window, changed)
-            if answer is Choice.SAVE:
-                self.export_motion()
+            if answer is Choice.SAVE and self.export_motion():
+                wait_for_exports(
+                    self._window,
+                    document,
+                    self._viewport.pictures,
+                    "Exporting",
+                    "What you asked for follows once that is done.",
+                )
+                return document.timeline.are_saved()
             return answer is Choice.DISCARD
         return True
 
@@ -706,21 +727,26 @@ class FileActions(QObject):
     @Slot(object)
     def _on_arrived(self, path: Path) -> None:
         """Remember a file that has been opened, and report those dropped with it."""
-        from lcollision_core.tasks.scenes import carried_pose
-
         if path.suffix.lower() in (*READABLE_SUFFIXES, *CHARACTER_SUFFIXES):
             self._remember(path)
-        before, self._pose_to_restore = self._pose_to_restore, None
-        pose = None
-        if before is not None:
-            posed, body, removed = before
-            pose = carried_pose(posed, body, self._document.model, removed)
-        if pose is not None:
-            self._document.history.load(f"Load {pose.name}", pose, Source.TRAINING)
+        carried, self._carried = self._carried, None
+        if carried is not None:
+            self._restore(carried)
         dropped, self._dropped = self._dropped, None
         if dropped is not None and dropped[0].absolute() == path.absolute():
             others = counted(dropped[1] - 1, "other file was", "other files were")
             self._document.message.emit(f"{self._last_message}; {others} not opened")
+
+    def _restore(self, carried: _Carried) -> None:
+        """Give the bodies that are still there their pose and their locks back."""
+        from lcollision_core.tasks.scenes import carried_domains, carried_pose
+
+        document, before, removed = self._document, carried.body, carried.removed
+        pose = carried.pose and carried_pose(carried.pose, before, document.model, removed)
+        if pose is not None:
+            document.history.load(f"Load {pose.name}", pose, Source.TRAINING)
+        for domain in carried_domains(carried.locked_domains, before, document.model, removed):
+            document.motion.set_locked(domain, locked=True)
 
     @Slot(str)
     def _on_message(self, sentence: str) -> None:

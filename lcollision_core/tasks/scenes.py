@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -201,24 +201,52 @@ def carried_pose(pose: NamedPose, before: Body, after: Body, removed: str = "") 
     if len(pose.latent) == after.latent_size:
         return pose
     old, new = as_scene(before), as_scene(after)
+    own = {
+        name: pose.latent if old is None else old.codes_of_member(old_name, pose.latent)
+        for old_name, name in _bodies_in_both(before, after, removed)
+    }
+    if not own:
+        return None
+    latent = own[""] if new is None else new.joined_codes([own.get(m.name) for m in new.members])
+    return NamedPose(pose.name, latent, pins=pose.pins)
+
+
+def carried_domains(
+    domains: Collection[int], before: Body, after: Body, removed: str = ""
+) -> frozenset[int]:
+    """Return those of some domains of a body or a scene that are left in another one.
+
+    Bodies match as in `carried_pose`.
+    """
+    left: set[int] = set()
+    for old_name, name in _bodies_in_both(before, after, removed):
+        old, new = _own_domains(before, old_name), _own_domains(after, name)
+        left |= {there for here, there in zip(old, new, strict=False) if here in domains}
+    return frozenset(left)
+
+
+def _bodies_in_both(before: Body, after: Body, removed: str) -> Iterator[tuple[str, str]]:
+    """Pair the names of bodies in a body or a scene and in another; a body alone has none."""
     posed, shown = (
         [("", body)] if scene is None else [(member.name, member.body) for member in scene.standing]
-        for scene, body in ((old, before), (new, after))
+        for scene, body in ((as_scene(before), before), (as_scene(after), after))
     )
-    own: dict[str, npt.NDArray[np.float64]] = {}
+    paired: set[str] = set()
     for old_name, old_body in posed:
         if removed and old_name == removed:
             continue
         for name, body in shown:
             is_same = body.fingerprint == old_body.fingerprint
-            if name not in own and is_same and (name == old_name or "" in (name, old_name)):
-                codes = pose.latent
-                own[name] = codes if old is None else old.codes_of_member(old_name, codes)
+            if name not in paired and is_same and (name == old_name or "" in (name, old_name)):
+                paired.add(name)
+                yield old_name, name
                 break
-    if not own:
-        return None
-    latent = own[""] if new is None else new.joined_codes([own.get(m.name) for m in new.members])
-    return NamedPose(pose.name, latent, pins=pose.pins)
+
+
+def _own_domains(body: Body, name: str) -> range:
+    """Return the domains of a body in a scene, or of a body alone."""
+    scene = as_scene(body)
+    return range(len(body.domain_names)) if scene is None else scene.domains_of_member(name)
 
 
 def with_ground(body: Body, body_file: str) -> str:

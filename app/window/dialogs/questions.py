@@ -230,8 +230,14 @@ def ask_to_discard(parent: QWidget, name: str) -> bool:
     return _confirm(parent, "Discard a model", text, note, ("Discard", "Cancel"), careful=True)
 
 
-def wait_for_exports(parent: QWidget, document: PoseDocument, pictures: Pictures) -> bool:
-    """Wait for pending exports as the window closes, in a dialog with a Cancel button.
+def wait_for_exports(
+    parent: QWidget,
+    document: PoseDocument,
+    pictures: Pictures,
+    title: str = "Closing",
+    note: str = "The editor closes once that is done.",
+) -> bool:
+    """Wait for pending exports, as while the window closes, in a dialog with a Cancel button.
 
     Returns
     -------
@@ -244,7 +250,7 @@ def wait_for_exports(parent: QWidget, document: PoseDocument, pictures: Pictures
     if not left():
         return True
     text = f"Finishing {counted(left(), 'export', 'exports')}…"
-    box = message_box(parent, "Closing", text, "The editor closes once that is done.")
+    box = message_box(parent, title, text, note)
     box.setStandardButtons(QMessageBox.StandardButton.Cancel)
     widen(box)
     failed = []

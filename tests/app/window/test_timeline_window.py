@@ -38,6 +38,7 @@ from tests.app.windows import (
     answer,
     drop,
     is_checked,
+    name_field,
     rest,
     settle_layout,
     shown,
@@ -802,6 +803,37 @@ def test_a_pose_is_asked_about_before_the_timeline_takes_its_place(
     assert asked == ["Save poses"]
     (again,) = read_poses(tmp_path / "mine.json", document.model)
     assert again.latent.tobytes() == mine.tobytes()
+
+
+def test_closing_goes_on_once_the_motion_is_exported(swinging: MainWindow, tmp_path: Path) -> None:
+    document = swinging.document
+    document.motion.set_solid(False)
+    document.timeline.go_to(20)
+    document.motion.set_code(10, float(document.history.latent[10]) + 0.3)
+    path, timers = tmp_path / "swung.glb", list[QTimer]()
+
+    def save(dialog: QDialog) -> None:
+        name_field(dialog).setText(str(path))
+        dialog.accept()
+
+    def accept(dialog: QDialog) -> None:
+        assert isinstance(dialog, MotionDialog)
+        timers.append(answer(save))
+        dialog.accept()
+
+    def export(dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        timers.append(answer(accept))
+        next(one for one in dialog.buttons() if "Export" in one.text().replace("&", "")).click()
+
+    timers.append(answer(export))
+    assert swinging.close()
+    assert not any(timer.isActive() for timer in timers)
+    assert document.timeline.are_saved()
+    (written,) = read_motions(open_body(path), path, CLIP)
+    exported = document.timeline.motion
+    assert exported is not None
+    np.testing.assert_allclose(written.codes, exported.codes, atol=1e-5)
 
 
 @pytest.mark.parametrize(("words", "closes"), [("Cancel", False), ("Discard", True)])

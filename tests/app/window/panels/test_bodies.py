@@ -299,6 +299,9 @@ def test_a_body_is_removed_and_the_others_keep_their_pose(
     posed = {name: scene.codes_of_member(name, document.history.latent) for name in scene.faces_of}
     assert scene.file is not None
     places = [part.at for part in scene.file.bodies]
+    for name, part in (("hero 2", 0), ("hero 3", 1)):
+        domain = scene.domains_of_member(name)[part]
+        document.motion.set_locked(domain, locked=True)
 
     def remove(row: int) -> None:
         tree.setCurrentItem(tree.topLevelItem(row))
@@ -314,6 +317,8 @@ def test_a_body_is_removed_and_the_others_keep_their_pose(
     for name in ("hero", "hero 3"):
         codes = pair.codes_of_member(name, document.history.latent)
         np.testing.assert_array_equal(codes, posed[name])
+    # A lock stays with its body.
+    assert document.motion.locked_domains == {pair.domains_of_member("hero 3")[1]}
     window.bodies.remove.setFocus()
     remove(0)
     # The list is gone, and the keys go to the view, not into a search field.
@@ -322,6 +327,7 @@ def test_a_body_is_removed_and_the_others_keep_their_pose(
     assert as_scene(document.model) is None
     assert document.model.fingerprint == open_body(hero).fingerprint
     np.testing.assert_array_equal(document.history.latent, posed["hero 3"])
+    assert document.motion.locked_domains == {1}
     assert window.docks["bodies"].isHidden()
 
 
