@@ -447,10 +447,11 @@ class Timeline(QObject):
 
     def _at(self, motion: Motion, frame: int, held: PoseFrame | None = None) -> DocumentState:
         """Return the state at a frame, with the pins moved to its patches."""
-        from lcollision_core.bodies import NamedPose
+        from lcollision_core.bodies import NamedPose, unique_names
 
         codes = motion.codes[frame] if held is None else held.latent
-        pose = NamedPose(f"{motion.name} {frame}", codes, motion.placement(frame))
+        (name,) = unique_names([f"{motion.name} {frame}"])
+        pose = NamedPose(name, codes, motion.placement(frame))
         moment = Moment(motion, frame)
         state = DocumentState(pose, moment=moment, ghost=self._ghost(motion, frame))
         if not self._history.pose.pins:

@@ -115,10 +115,12 @@ def _plural(part: str) -> str:
 def unique_names(names: Iterable[str], max_length: int = MAX_POSE_NAME_LENGTH) -> list[str]:
     """Return the names, numbered if equal to an earlier one up to case: "a", "A 2".
 
-    Numbered names are at most `max_length` long.
+    They are cut to `max_length` characters.
     """
     return make_unique(
-        names, str.casefold, lambda name, ending: name[: max_length - len(ending)] + ending
+        (name[:max_length] for name in names),
+        str.casefold,
+        lambda name, ending: name[: max_length - len(ending)] + ending,
     )
 
 

@@ -6,6 +6,7 @@ import base64
 import binascii
 import hashlib
 import json
+import re
 import struct
 from collections.abc import Sequence
 from copy import copy, deepcopy
@@ -68,6 +69,9 @@ _FREE = ("extras", "extensions")
 
 _CHANGED = ("nodes", "meshes", "scenes", "images", "extensions")
 """Parts of a description that an editable copy may change in any way."""
+
+_ESCAPES = re.compile(rb"(\\[^u]|\\u[dD][89abAB]..\\u[dD][c-fC-F])|\\u[dD][89a-fA-F]..")
+"""Escaped characters of JSON, of which the first group is whole."""
 
 _LARGEST = 1e100
 """Largest number in a description, so that products of a few are finite."""
@@ -541,6 +545,8 @@ def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
 
 def _parsed(text: bytes) -> dict[str, Any]:
     """Parse a description and check that it has the structure of glTF."""
+    # A lone surrogate can neither be printed nor be written again.
+    text = _ESCAPES.sub(lambda escape: escape[1] or rb"\ufffd", text)
     try:
         values = parse_json(text)
     except ValueError as error:

@@ -38,7 +38,7 @@ from lcollision_core.tasks.verdicts import ResolvedClip
 from tests.app.support import Lcollision
 from tests.core.bodies.test_retargeting import of_rig
 from tests.core.fbx_builder import character_fbx
-from tests.core.gltf_builder import GltfBuilder
+from tests.core.gltf_builder import GltfBuilder, arm
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import write_gltf
 
@@ -216,6 +216,22 @@ def test_a_motion_is_also_written_as_poses_and_as_frames(
     (row,) = json.loads(again.stdout)
     assert row["free_before"] == row["frames"] == len(held)
     assert row["largest_change"] == 0.0
+
+
+def test_a_clip_of_any_name_is_checked_and_written(lcollision: Lcollision, tmp_path: Path) -> None:
+    for name in ("\ud800 wave", "w" * 300):
+        builder = arm()
+        builder.description["animations"][0]["name"] = name
+        file = builder.write(tmp_path / "arm.glb")
+        poses, frames, table = tmp_path / "free.json", tmp_path / "free", tmp_path / "frames.csv"
+        assert lcollision("check", file, "--clips", "--csv", table).exit_code == 0
+        for out in (poses, f"{frames}/"):
+            again = ("--motion", "--fps", 5, "--in-place", "-o", out)
+            assert lcollision("resolve", file, *again).exit_code == 0
+        n_frames = len(read_poses(poses, open_body(file)))
+        assert len(list(frames.iterdir())) == n_frames > 3
+        for out in (poses, *frames.iterdir()):
+            out.unlink()
 
 
 @pytest.mark.slow

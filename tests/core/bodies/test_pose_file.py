@@ -338,7 +338,7 @@ def test_refused_poses_leave_the_old_file(model: LearnedBody, path: Path) -> Non
 def test_names_are_numbered_until_they_differ_by_more_than_case() -> None:
     assert unique_names(["a", "b", "A", "a", "a 2"]) == ["a", "b", "A 2", "a 3", "a 2 2"]
     long = "x" * 200
-    assert unique_names([long, long]) == [long, "x" * 198 + " 2"]
+    assert unique_names([long, f"{long} 1"]) == [long, "x" * 198 + " 2"]
 
 
 def test_any_files_name_makes_a_poses_name(model: LearnedBody, tmp_path: Path) -> None:
