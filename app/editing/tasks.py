@@ -15,12 +15,18 @@ import numpy.typing as npt
 from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
 
 from app.editing.history import Source, named_after, read_only
-from app.work.preparing import open_poses_to_show, open_to_show, prepare, ready
+from app.work.preparing import open_pose_file_to_show, open_to_show, prepare, ready
 from app.work.threads import Failure, LongWork, Task, as_task
 from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
 from lcollision_core.tasks import changing
 from lcollision_core.tasks.editing import mirror_poses, resolve_pose, save_poses
-from lcollision_core.tasks.opening import OpenedModel, ReadPoses, examine, import_mesh
+from lcollision_core.tasks.opening import (
+    MemberPose,
+    OpenedModel,
+    ReadPoses,
+    examine,
+    import_mesh,
+)
 from lcollision_core.tasks.words import (
     counted,
     fit_error,
@@ -99,6 +105,7 @@ class Tasks(QObject):
     opened : Path, the file of poses or of a model that is now open
     imported : Path, the mesh that has become the pose
     of_other_model : OtherModelError, if a poses file needs another known model
+    of_member : MemberPose, if a poses file is of one of the scene's bodies
     wrong_scale : Path and WrongScaleError, if a mesh to import is in another unit
     contacts_counted : ContactsAtRest
     pairs_proposed : dict of tuples of ProposedPair, by kind of group
@@ -116,6 +123,7 @@ class Tasks(QObject):
     opened = Signal(object)
     imported = Signal(object)
     of_other_model = Signal(object)
+    of_member = Signal(object)
     wrong_scale = Signal(object, object)
     contacts_counted = Signal(object)
     pairs_proposed = Signal(object)
@@ -372,14 +380,15 @@ class Tasks(QObject):
         """Read a poses file in the long worker and edit its working pose, or else its first.
 
         The library does not change: the file's poses become `file_poses`. If the file needs
-        another known model, `of_other_model` is emitted.
+        another known model, `of_other_model` is emitted; if it is of one of the bodies of a scene,
+        `of_member`.
 
         Parameters
         ----------
         model_file : a model to load too; if None, the poses are those of the present model
         """
         body = None if model_file else self._model
-        work = partial(open_poses_to_show, body, model_file or "", Path(path))
+        work = partial(open_pose_file_to_show, body, model_file or "", Path(path))
         self.start_loading(f"Opening {Path(path).name}", work, self._on_poses)
 
     def save(self, path: str | Path | None = None) -> None:
@@ -512,9 +521,12 @@ class Tasks(QObject):
         self.message.emit("; ".join((f"Opened {opened.model.name}", *opened.model.notes)))
         self.opened.emit(Path(opened.file))
 
-    def _on_poses(self, read: ReadPoses | OtherModelError) -> None:
+    def _on_poses(self, read: ReadPoses | MemberPose | OtherModelError) -> None:
         if isinstance(read, LCollisionError):
             self.of_other_model.emit(read)
+            return
+        if isinstance(read, MemberPose):
+            self.of_member.emit(read)
             return
         if read.opened is not None:
             self.model_opened.emit(read.opened)

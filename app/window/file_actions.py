@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from PySide6.QtCore import QObject, Qt, QTimer, Signal, Slot
-from PySide6.QtWidgets import QDialog, QFileDialog, QWidget
+from PySide6.QtWidgets import QDialog, QFileDialog, QInputDialog, QWidget
 
-from app.editing.history import Source, named_after
+from app.editing.history import Source, named_after, read_only
 from app.window.dialogs.forms import (
     ExportDialog,
     MotionDialog,
@@ -52,7 +52,7 @@ from lcollision_core.files.table import (
 )
 from lcollision_core.tasks.editing import save_poses
 from lcollision_core.tasks.opening import AnimationAlone, OtherMesh
-from lcollision_core.tasks.words import counted, menu_text
+from lcollision_core.tasks.words import counted, menu_text, say
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from lcollision_core.errors import WrongScaleError
     from lcollision_core.motion import Motion
     from lcollision_core.options import ExportRequest
-    from lcollision_core.tasks.opening import FileContent
+    from lcollision_core.tasks.opening import FileContent, MemberPose
 
 _VIDEOS = {"GIF": ".gif", "WebP": ".webp", "PNG sequence in a new folder": ".png"}
 
@@ -154,6 +154,7 @@ class FileActions(QObject):
         document.tasks.of_other_model.connect(
             self._on_other_model, Qt.ConnectionType.QueuedConnection
         )
+        document.tasks.of_member.connect(self._on_member, Qt.ConnectionType.QueuedConnection)
         document.tasks.wrong_scale.connect(self._offer_scale, Qt.ConnectionType.QueuedConnection)
         self._dropped: tuple[Path, int] | None = None
         self._last_message = ""
@@ -761,6 +762,33 @@ class FileActions(QObject):
         may_switch = ask_to_switch(self._window, Path(found.where).name, name, differs)
         if may_switch and self._may_lose_library():
             self._document.tasks.open_poses(found.where, found.model.path)
+
+    @Slot(object)
+    def _on_member(self, read: MemberPose) -> None:
+        """Give one body of the scene the pose of its file; the others keep theirs."""
+        from lcollision_core.bodies import as_scene
+
+        document, pose, name = self._document, read.pose, read.members[0]
+        scene = as_scene(document.model)
+        if len(read.members) > 1:
+            title, text = "Open poses", f"Which body takes the pose “{pose.name}”?"
+            name, is_chosen = QInputDialog.getItem(
+                self._window, title, text, read.members, 0, editable=False
+            )
+            scene = scene if is_chosen else None
+        if scene is None or name not in {member.name for member in scene.standing}:
+            return
+        history = document.history
+        latent = scene.with_codes_of_member(name, history.latent, pose.latent)
+        history.push(f"Load {pose.name}", history.with_latent(read_only(latent)))
+        self._remember(read.path)
+        text = say(
+            "Loaded the pose {pose} of {file} onto {body}",
+            pose=pose.name,
+            file=read.path.name,
+            body=name,
+        )
+        document.message.emit(text)
 
     @Slot()
     def _on_model(self) -> None:

@@ -17,12 +17,14 @@ from app.work import compile_ahead
 from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.tasks.opening import (
+    MemberPose,
     OpenedModel,
     OpenedMotions,
     ReadPoses,
     open_model,
     open_motions,
     open_poses,
+    pose_of_member,
 )
 
 if TYPE_CHECKING:
@@ -51,6 +53,14 @@ def open_poses_to_show(
     if isinstance(read, ReadPoses) and read.opened is not None:
         return replace(read, opened=ready(read.opened, job))
     return read
+
+
+def open_pose_file_to_show(
+    body: Body | None, model_file: str | Path, path: Path, job: Job
+) -> ReadPoses | MemberPose | OtherModelError:
+    """Read the pose of a body of the open scene, or else a poses file as `open_poses_to_show`."""
+    of_member = None if body is None else pose_of_member(body, path)
+    return of_member or open_poses_to_show(body, model_file, path, job)
 
 
 def open_motions_to_show(body: Body, path: Path, job: Job) -> OpenedMotions:

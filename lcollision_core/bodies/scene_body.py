@@ -399,6 +399,12 @@ class SceneBody(Body):
         at = next(n for n, entry in enumerate(self.standing) if entry.name == name)
         return self._space.of(latent, at)
 
+    def with_codes_of_member(self, name: str, latent: FloatArray, codes: FloatArray) -> FloatArray:
+        """Return (D,) codes with those of a moving body replaced by (D_k,) codes."""
+        own = {m.name: self.codes_of_member(m.name, latent) for m in self.standing if m.moves}
+        own[name] = codes
+        return self.joined_codes([own.get(member.name) for member in self.members])
+
     def domains_of_member(self, name: str) -> range:
         """Return the body parts of a body and what it holds; empty for a held body."""
         for member, own in zip(self.standing, self._space.domains, strict=True):

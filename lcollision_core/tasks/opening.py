@@ -170,6 +170,46 @@ def open_poses(
     return ReadPoses(path, content, stamp, opened)
 
 
+@dataclass(frozen=True, eq=False)
+class MemberPose:
+    """The pose of one of a scene's bodies, by a poses file of that body.
+
+    Attributes
+    ----------
+    path : of the file
+    pose : its working pose, or else its first
+    members : names of the bodies of the scene that it fits
+    """
+
+    path: Path
+    pose: NamedPose
+    members: tuple[str, ...]
+
+
+def pose_of_member(body: Body, path: Path) -> MemberPose | None:
+    """Return the pose of a file that is of a body of a scene; None if it is of none of them.
+
+    Raises
+    ------
+    LCollisionError : the file can't be read.
+    """
+    from lcollision_core.bodies import OtherModelError, as_scene, read_pose_file
+
+    scene = as_scene(body)
+    bodies = {} if scene is None else {m.name: m.body for m in scene.standing if m.moves}
+    for own in bodies.values():
+        try:
+            content = read_pose_file(path, own)
+        except OtherModelError:
+            continue
+        fitting = tuple(
+            name for name, other in bodies.items() if other.fingerprint == own.fingerprint
+        )
+        for pose in content.all_poses if content.working is None else (content.working,):
+            return MemberPose(path, pose, fitting)
+    return None
+
+
 def import_mesh(
     body: Body, path: Path, scale: float, is_asked_as_mesh: bool, job: Job
 ) -> NamedPose | WrongScaleError:

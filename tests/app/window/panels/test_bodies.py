@@ -17,6 +17,7 @@ from PySide6.QtWidgets import (
     QAbstractSpinBox,
     QDialog,
     QFileDialog,
+    QInputDialog,
     QLabel,
     QMessageBox,
     QTabBar,
@@ -31,7 +32,7 @@ from app.window.dialogs.forms import SceneExportDialog
 from app.window.dialogs.questions import FailureDialog, ask_to_join
 from app.window.main_window import MainWindow
 from app.window.widgets import NameLabel
-from lcollision_core.bodies import Body, as_scene, open_body
+from lcollision_core.bodies import Body, NamedPose, as_scene, open_body, write_poses
 from lcollision_core.bodies.scene_file import open_scene_file
 from lcollision_core.tasks.scenes import kept_scene, scene_of_files, with_body
 from tests.app.windows import PATIENCE, answer, drop, open_window, settings_in
@@ -329,6 +330,49 @@ def test_a_body_is_removed_and_the_others_keep_their_pose(
     np.testing.assert_array_equal(document.history.latent, posed["hero 3"])
     assert document.motion.locked_domains == {1}
     assert window.docks["bodies"].isHidden()
+
+
+@pytest.mark.parametrize("chosen", ["villain", "hero 2", None])
+def test_a_pose_of_one_body_is_loaded_onto_it_in_a_scene(
+    qtbot: QtBot,
+    hero: Path,
+    tmp_path: Path,
+    chosen: str | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    villain = write_gltf(rigged_body(girth=0.15), tmp_path / "villain.glb")
+    scene = open_scene_file(kept_scene(scene_of_files([hero, hero, villain])))
+    window = open_window(qtbot, PoseDocument(scene), settings_in(tmp_path))
+    document, history = window.document, window.document.history
+    before = np.linspace(0.0, 0.02, scene.latent_size)
+    for code, value in enumerate(before):
+        document.motion.set_code(code, float(value))
+    before = history.latent
+    history.mark_saved()
+    body = open_body(villain if chosen == "villain" else hero)
+    pose = NamedPose("wave", np.full(body.latent_size, 0.03))
+    write_poses(tmp_path / "wave.json", body, [pose])
+    asked: list[object] = []
+
+    def choose(*given: object, **_: object) -> tuple[str, bool]:
+        asked.append(given[2:4])
+        return chosen or "hero", chosen is not None
+
+    monkeypatch.setattr(QInputDialog, "getItem", choose)
+    with qtbot.waitSignal(document.tasks.of_member, timeout=PATIENCE):
+        drop(window, tmp_path / "wave.json")
+    if chosen is None:
+        qtbot.waitUntil(lambda: bool(asked))
+        assert history.latent is before
+        return
+    qtbot.waitUntil(lambda: history.latent is not before)
+    question = ("Which body takes the pose “wave”?", ("hero", "hero 2"))
+    assert asked == ([] if chosen == "villain" else [question])
+    for member in scene.standing:
+        codes, kept = (scene.codes_of_member(member.name, of) for of in (history.latent, before))
+        np.testing.assert_array_equal(codes, pose.latent if member.name == chosen else kept)
+    history.undo_stack.undo()
+    np.testing.assert_array_equal(history.latent, before)
 
 
 def test_a_scene_that_cannot_be_opened_leaves_no_pose_to_the_next_body(
