@@ -8,6 +8,7 @@ entries (a_i^T A^-1 a_j) (n_i^T G^-1 n_j).
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,9 +34,10 @@ as when all codes that could change them are locked or pinned."""
 _TOLERANCE, _MOST_ITERATIONS, _PATIENCE = 1e-8, 2000, 3
 """Tolerance of a half-space, most iterations, and most successive ones without progress."""
 
-_ADDED = 150
+_ADDED, _DROPPING_ROUNDS = 150, 30
 """Half-spaces that a program begins with, those of least slack, and most violated ones that are
-added to its active ones until none is violated: of thousands, few are active."""
+added to its active ones in each round until none is violated: of thousands, few are active. Later
+rounds keep inactive ones too, as rounding could let the same ones come and go for ever."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +166,7 @@ def least_corrections(
     slack_at_mean = slack(kernel.mean)
     active = np.arange(n_equal)
     added = n_equal + np.argsort(slack_at_mean[n_equal:], kind="stable")[:_ADDED]
-    while True:
+    for number in itertools.count():
         rows = np.concatenate([active, added])
         gram = (along[rows] @ shares[rows].T) * (across[rows] @ normals[rows].T)
         gram *= np.outer(scale[rows], scale[rows])
@@ -179,10 +181,12 @@ def least_corrections(
         left = slack(moved)
         left[rows] = 0.0
         if (left >= -_TOLERANCE).all():
-            return moved
-        active = np.concatenate([active[:n_equal], rows[n_equal:][multipliers[n_equal:] > 0.0]])
+            break
+        is_kept = (multipliers > 0.0) | (np.arange(len(rows)) < n_equal)
+        active = rows[is_kept] if number < _DROPPING_ROUNDS else rows
         worst = np.argsort(left, kind="stable")[:_ADDED]
         added = worst[left[worst] < -_TOLERANCE]
+    return moved
 
 
 def _solve_program(
