@@ -206,8 +206,14 @@ class SceneBody(Body):
         several = "it has several bodies", "mirror the pose of each by itself"
         only = self.only_posed
         self.no_sides = several if only is None else only.body.no_sides
+        held = "it is held, so its own clips are left out"
         self.notes = tuple(
-            f"{member.name}: {note}" for member in members for note in member.body.notes
+            f"{member.name}: {note}"
+            for member in members
+            for note in (
+                *member.body.notes,
+                *([held] if member.holder is not None and member.body.own_clips else []),
+            )
         )
 
     def with_file(self, file: SceneFile) -> SceneBody:

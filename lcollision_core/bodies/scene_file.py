@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +21,24 @@ from lcollision_core.bodies.remembered import open_body, open_character
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember, ScenePart
 from lcollision_core.errors import LCollisionError, ModelFileError, listed
-from lcollision_core.files import Character, Rig, read_character, read_mesh
+from lcollision_core.files import Character, ClipFrames, Rig, read_character, read_mesh
 from lcollision_core.files.safe import read_regular, write_bytes
 from lcollision_core.files.scene.transforms import from_rotation_vectors
 from lcollision_core.files.table import READABLE_SUFFIXES, SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.json_values import from_json, parse_document, parse_json
 from lcollision_core.meshes import RigidTransform, Topology
+from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.extents import guess_up
+from lcollision_core.meshes.topology import FloatArray
 
 SCENE_FORMAT, _VERSION = "lcollision-scene", 1
 _MAX_BYTES = 10_000_000
 
 _IN_HAND = 0.15
 """Normalised distance from its joint within which a held prop stays in place."""
+
+_RIGID = 1e-6
+"""Deviation from a rigid motion, by the size of a prop, that is ignored."""
 
 _GROUND_SIDE = 10.0
 """Normalised margin of the ground around the bodies."""
@@ -298,7 +303,7 @@ def _character_of_mesh(path: Path) -> Character:
 
 
 def _prop(character: Character) -> Character:
-    """Give a mesh one joint at its centre that moves all of it."""
+    """Give a mesh one joint at its centre that moves all of it, also in its clips."""
     vertices = character.rest_vertices
     rest = np.eye(4)[None].copy()
     rest[0, :3, 3] = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
@@ -312,4 +317,27 @@ def _prop(character: Character) -> Character:
         np.ones((n, 1)),
         vertices[:, None].copy(),
     )
-    return replace(character, rig=rig, clips={})
+
+    def sample(clip: str, fps: float | FloatArray | None) -> ClipFrames:
+        frames = character.sample(clip, fps)
+        times, n_frames = frames.times, len(frames.times)
+
+        def fit(frame: int) -> tuple[FloatArray, FloatArray]:
+            """Return how a frame is moved as a whole, and its vertices moved back."""
+            posed = character.sample(clip, times[frame : frame + 1]).vertices[0]
+            back = RigidTransform(*fit_rigid(posed, vertices))
+            return back.inverse().matrix @ rest[0], back.apply(posed)[:, None]
+
+        def points(frame: int) -> FloatArray:
+            return fit(frame)[1]
+
+        transforms, deforms = np.empty((n_frames, 1, 4, 4)), np.zeros(n_frames, dtype=np.bool_)
+        for frame in range(n_frames):
+            transforms[frame, 0], shape = fit(frame)
+            deforms[frame] = (
+                np.abs(shape - rig.points).max() > _RIGID * np.ptp(vertices, axis=0).max()
+            )
+        own_points = {frame: partial(points, frame) for frame in np.flatnonzero(deforms).tolist()}
+        return replace(frames, transforms=transforms, points=own_points)
+
+    return replace(character, rig=rig, sample=sample)

@@ -235,6 +235,8 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
     """
     if request.scene.has_others or is_scene_file(path):
         scene = _as_asked(body_of_scene(scene_of(str(path), request.scene)), request)
+        for sentence in scene.notes:
+            job.note(sentence)
         motion, _ = scene_motion(scene, request.scene.played, request.motion, job)
         return _check_motions(scene, [motion], path, request, job)
     if request.body is not None:

@@ -618,6 +618,8 @@ def resolve_scene_motion(
         `in_place` is not set.
     CancelledError : the job was cancelled; finished frames are kept beside the output.
     """
+    for sentence in body.notes:
+        job.note(sentence)
     motion, of_bodies = scene_motion(body, played, request.choice, job)
     output = request.output
     if output.form == "mesh":

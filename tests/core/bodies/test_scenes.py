@@ -18,11 +18,13 @@ from lcollision_core.bodies.scene_file import (
     write_scene_file,
 )
 from lcollision_core.errors import LCollisionError, ModelFileError
-from lcollision_core.files import write_mesh
-from lcollision_core.options import ExportRequest, ResolveOptions
+from lcollision_core.files import read_character, write_mesh
+from lcollision_core.options import ExportRequest, MotionChoice, ResolveOptions
 from lcollision_core.posing import DragOptions, Grip
 from lcollision_core.tasks.exporting import write_members
 from lcollision_core.tasks.opening import open_any
+from lcollision_core.tasks.scenes import scene_motion
+from tests.core.gltf_builder import GltfBuilder, rotation
 from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import FloatArray, rigged_body, write_gltf
 from tests.small_models import DATA
@@ -243,6 +245,40 @@ def test_what_a_hand_holds_moves_with_it_and_may_touch_it(folder: Path) -> None:
     rows = body.vertices_of["box"]
     at_rest = body.reference[rows] @ move[:3, :3].T + move[:3, 3]
     assert np.allclose(body.decode(codes)[rows], at_rest)
+
+
+@pytest.mark.parametrize("deforms", [False, True])
+def test_a_prop_plays_its_own_clip_unless_it_is_held(
+    folder: Path, tmp_path: Path, deforms: bool
+) -> None:
+    builder, times = GltfBuilder(), [0.0, 0.5, 1.0]
+    primitive = {
+        "attributes": {"POSITION": builder.array((_BOX - 0.5) * [0.1, 0.4, 0.1])},
+        "indices": builder.array(_BOX_FACES.reshape(-1), "u2"),
+    }
+    node = builder.add("nodes", mesh=builder.add("meshes", primitives=[primitive]))
+    sizes = [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0] if deforms else [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]
+    flight = [[1.0, 1.2, 0.0], [0.0, 1.2, 0.0], [-2.0, 1.2, 0.0]]
+    turns = [rotation(2, angle) for angle in (0.0, 1.0, 2.0)]
+    builder.animation(
+        "fly",
+        *(
+            {"node": node, "path": path, "times": times, "values": values}
+            for path, values in (("translation", flight), ("rotation", turns), ("scale", sizes))
+        ),
+    )
+    axe = builder.write(tmp_path / "axe.glb")
+    parts = ScenePart(str(folder / "hero.glb")), ScenePart(str(axe))
+    body = body_of_scene(SceneFile(parts))
+    motion, _ = scene_motion(body, (), MotionChoice())
+    frames = read_character(axe).sample("fly", motion.rate)
+    check, rows = body.exact_check(), body.vertices_of["axe"]
+    for number, vertices in enumerate(frames.vertices):
+        assert np.allclose(motion.vertices(number, check)[rows], vertices, atol=1e-6)
+    collides = ~check.are_free(motion.codes)
+    assert 0 < collides.sum() < len(collides) == len(frames.times)
+    held = body_of_scene(SceneFile((parts[0], replace(parts[1], held_by="hero", joint="LeftHand"))))
+    assert held.notes == ("axe: it is held, so its own clips are left out",)
 
 
 def test_a_prop_elsewhere_comes_to_the_joint_that_holds_it(tmp_path: Path, folder: Path) -> None:
