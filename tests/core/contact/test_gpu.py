@@ -12,8 +12,6 @@ import pytest
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import MissingExtraError
 
-_ROOMS = ("contact", "predictor")
-
 
 def _run(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
@@ -25,25 +23,15 @@ def _run(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def _test_on_simulated_gpu(room: str, marked: str) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize("room", ["contact", "predictor"])
+def test_a_gpu_finds_what_the_processor_finds(room: str) -> None:
     tests = Path(__file__).parents[1] / room / "simulated_gpu.py"
-    words = ("-m", "pytest", "-q", "-n", "0", "-m", marked, str(tests))
-    done = _run(*words, NUMBA_ENABLE_CUDASIM="1")
+    done = _run("-m", "pytest", "-q", "-n", "0", str(tests), NUMBA_ENABLE_CUDASIM="1")
     assert done.returncode == 0, done.stdout
     assert "passed" in done.stdout
     assert "skipped" not in done.stdout
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("room", _ROOMS)
-def test_a_gpu_finds_what_the_processor_finds(room: str) -> None:
-    _test_on_simulated_gpu(room, "not slow")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("room", _ROOMS)
-def test_a_gpu_finds_what_the_processor_finds_in_long_tests_too(room: str) -> None:
-    _test_on_simulated_gpu(room, "slow")
+    assert "deselected" not in done.stdout
 
 
 def test_checking_many_poses_imports_nothing_of_cuda() -> None:

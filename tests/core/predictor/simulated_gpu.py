@@ -35,6 +35,7 @@ from lcollision_core.predictor.gpu_graph import Replayed
 from lcollision_core.predictor.predictor import TrainingFacts, runs_as_graph
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import colliding_latent, weights_of
+from tests.core.simulator import poll_politely
 
 _launch = gpu_inputs.launch
 _aten = torch.ops.aten
@@ -95,6 +96,7 @@ def _recorded_launch(*arguments: Any) -> None:
 @pytest.fixture(autouse=True)
 def _gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     assert SIMULATED
+    poll_politely(monkeypatch)
     stream = SimpleNamespace(wait_stream=lambda _: None)
     monkeypatch.setattr(torch.cuda, "CUDAGraph", SimulatedGraph)
     monkeypatch.setattr(torch.cuda, "graph", lambda graph: graph)
@@ -144,7 +146,6 @@ def test_inputs_are_the_processors(
     assert network.float()._gpu_inputs(codes[:0])[0].shape == (24, 0, 16)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("_inputs_on_gpu")
 def test_replayed_predictions_are_the_processors(
     tube_model: LearnedBody, tube_folds: np.ndarray, monkeypatch: pytest.MonkeyPatch
@@ -182,7 +183,6 @@ def _trained(model: LearnedBody, rows: LabelRows) -> bytes:
     return weights_of(dict(train_predictor(rows, model.embedding, config, device="cpu").arrays))
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("_inputs_on_gpu")
 def test_replayed_steps_train_as_steps_one_by_one(
     tube_model: LearnedBody, monkeypatch: pytest.MonkeyPatch
