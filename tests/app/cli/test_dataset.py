@@ -136,19 +136,6 @@ def test_make_refuses_a_bad_output_before_it_works(lcollision: Lcollision, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
-def test_made_body_is_a_pose_set(lcollision: Lcollision, tmp_path: Path) -> None:
-    output = tmp_path / "body.npz"
-    result = lcollision("dataset", "make", "body", "-o", output)
-    assert result.exit_code == 0
-    poses = read_pose_set(output)
-    assert poses.vertices.shape == (71, 2161, 3)
-    assert poses.topology.is_watertight
-    report = json.loads(lcollision("dataset", "check", output, "--json").stdout)
-    assert report["problems"] == []
-    assert report["colliding_poses"] <= 5
-
-
 def test_the_frames_of_characters_become_a_pose_set(lcollision: Lcollision, tmp_path: Path) -> None:
     output = tmp_path / "arm.npz"
     files = [arm().write(tmp_path / name) for name in ("one.glb", "two.vrm")]

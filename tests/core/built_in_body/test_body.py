@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,9 +25,10 @@ from lcollision_core.built_in_body.motions import authored_poses
 from lcollision_core.built_in_body.skeleton import BONES, Skeleton, limits_of, turn_z
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import MissingExtraError, ShapeError
-from lcollision_core.files import PoseSet
+from lcollision_core.files import PoseSet, read_pose_set
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import Topology, body_size
+from tests.app.support import Lcollision
 
 pytestmark = pytest.mark.slow  # Only developers build the body; users have the bundled model.
 
@@ -86,6 +89,22 @@ def test_sets_have_the_stated_shapes(bodies: dict[str, PoseSet]) -> None:
     assert bodies["body"].names[0] == "rest"
     assert bodies["body-jump"].names[12] == "frame 12"
     assert body_set.DEFAULT_VERTICES == {"body": 2161, "body-swing": 10001, "body-jump": 10002}
+
+
+def test_made_body_is_a_pose_set(
+    template: Template, lcollision: Lcollision, tmp_path: Path
+) -> None:
+    """The command is tested here, where the template it needs has been built."""
+    assert build_template(2161) is template
+    output = tmp_path / "body.npz"
+    result = lcollision("dataset", "make", "body", "-o", output)
+    assert result.exit_code == 0
+    poses = read_pose_set(output)
+    assert poses.vertices.shape == (71, 2161, 3)
+    assert poses.topology.is_watertight
+    report = json.loads(lcollision("dataset", "check", output, "--json").stdout)
+    assert report["problems"] == []
+    assert report["colliding_poses"] <= 5
 
 
 def test_progress_counts_every_pose(template: Template) -> None:

@@ -167,11 +167,13 @@ def test_no_scheduler_and_no_worker_are_told(
         for address in ("tcp://127.0.0.1:9", "nonsense://nowhere"):
             with pytest.raises(LCollisionError, match=f"no Dask scheduler answers at {address}"):
                 label_poses(labeller, tmp_path / "store", 10, scheduler=address)
-    with (
-        LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=":0") as empty,
-        pytest.raises(LCollisionError, match="has no workers; start some with `dask worker"),
-    ):
-        label_poses(labeller, tmp_path / "store", 10, scheduler=empty.scheduler_address)
+        # Long enough to reach the scheduler on a busy machine.
+        hasty.setattr(labelling_run, "_CONNECT_SECONDS", 5)
+        with (
+            LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=":0") as empty,
+            pytest.raises(LCollisionError, match="has no workers; start some with `dask worker"),
+        ):
+            label_poses(labeller, tmp_path / "store", 10, scheduler=empty.scheduler_address)
 
 
 def test_without_dask_the_extra_is_named(
