@@ -24,7 +24,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run([*pip, *wheel, str(folder), str(ROOT)], check=True)
     (built,) = folder.glob("lcollision-*.whl")
     target = folder / "site"
-    install = ["install", "--no-deps", "--no-index", "--target"]
+    install = ["install", "--no-compile", "--no-deps", "--no-index", "--target"]
     subprocess.run([*pip, *install, str(target), str(built)], check=True)
     return target
 

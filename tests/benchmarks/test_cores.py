@@ -15,7 +15,8 @@ pytestmark = pytest.mark.slow
 def test_the_command_prints_a_row_for_each_loop(
     lcollision: Lcollision, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cores, "_SECONDS", 0.05)
+    monkeypatch.setattr(cores, "_SECONDS", 0.02)
+    monkeypatch.setattr(cores, "_ROUNDS", 3)
     result = lcollision("benchmark", "cores", "-n", 32, "--json")
     assert result.exit_code == 0
     rows = {row["what"]: row for row in json.loads(result.stdout)}

@@ -40,7 +40,7 @@ KINDS = {
     "120 a second": ({"fps": 120.0, "n_frames": 120}, "LINEAR"),
     "25 metres": ({"travel": 25.0}, "LINEAR"),
     "2 frames": ({"n_frames": 2, "begin": 0.4}, "LINEAR"),
-    "240 frames": ({"n_frames": 240, "n_swings": 5}, "LINEAR"),
+    "150 frames": ({"n_frames": 150, "n_swings": 3}, "LINEAR"),
     "a cycle": ({"begin": 0.5}, "LINEAR"),
 }
 """Arguments of `swinging_body`, and the interpolation of the keys."""

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import scoring
 from lcollision_core.files import PoseSet, read_pose_set, write_mesh
 from tests.app.support import Lcollision
 from tests.independent_check import crossing_pairs, read_obj
@@ -45,9 +46,14 @@ def test_colliding_poses_of_the_bundled_body_end_free(
 
 
 def test_scape_from_meshes_to_an_exported_pose(
-    scape: PoseSet, lcollision: Lcollision, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scape: PoseSet,
+    lcollision: Lcollision,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A folder of scans, three commands to a model, and one scan resolved."""
+    monkeypatch.setattr(scoring, "CARD_POSES", 40)
     folder = tmp_path / "scans"
     folder.mkdir()
     for number, vertices in enumerate(scape.vertices):
@@ -57,8 +63,8 @@ def test_scape_from_meshes_to_an_exported_pose(
     scan, fixed = folder / "mesh007.obj", tmp_path / "fixed.obj"
     assert crossing_pairs(*read_obj(scan))
     steps = {
-        "train embedding": (folder, "-o", model),
-        "label": (model, "-n", 3000, "-o", store),
+        "train embedding": (folder, "--domains", 4, "-o", model),
+        "label": (model, "-n", 1000, "-o", store),
         "train predictor": (model, store, "-o", model),
         "resolve": (model, scan, "-o", fixed),
     }
