@@ -48,6 +48,8 @@ def crossing_pairs(vertices: Array, faces: npt.NDArray[np.int64]) -> set[tuple[i
     near = np.sort(near[rank[near[:, 1]] < rank[near[:, 0]]], axis=1)
     apart = np.linalg.norm(middle[near[:, 0]] - middle[near[:, 1]], axis=1)
     near = near[apart <= radius[near].sum(axis=1)]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    near = near[(low[near] <= high[near[:, ::-1]]).all(axis=(1, 2))]
     shared = (faces[near[:, 0], :, None] == faces[near[:, 1], None, :]).any(axis=(1, 2))
     near = near[~shared]
     found = np.zeros(len(near), dtype=bool)
@@ -116,9 +118,10 @@ class IndependentRules:
         """Return, for each vertex, twice the limb's thickness at the nearest joint."""
         own: dict[int, float] = {}
         for about in joints:
-            middles = np.array([rest[faces[face]].mean(axis=0) for face in sorted(about)])
-            thickness = max(float(np.linalg.norm(m - middles.mean(axis=0))) for m in middles)
-            self._fold_joints.append((middles.mean(axis=0), 2.0 * thickness))
+            middles = rest[faces[sorted(about)]].mean(axis=1)
+            centre = middles.mean(axis=0)
+            thickness = float(np.linalg.norm(middles - centre, axis=1).max())
+            self._fold_joints.append((centre, 2.0 * thickness))
             for vertex in {int(v) for face in about for v in faces[face]}:
                 own[vertex] = min(2.0 * thickness, own.get(vertex, np.inf))
         if not own:
@@ -235,21 +238,16 @@ def faces_about_joints(
     def radius(own: list[int], start: Array, end: Array) -> float:
         length = float(np.linalg.norm(end - start))
         way = (end - start) / length if length else np.zeros(3)
-        along = [float(np.dot(middle[f] - start, way)) for f in own]
-        away = [
-            float(np.linalg.norm(middle[f] - start - s * way))
-            for f, s in zip(own, along, strict=True)
-        ]
-        near = [d for d, s in zip(away, along, strict=True) if abs(s) <= length / 3.0]
-        return float(np.percentile(near or away, 75.0))
+        arms = middle[own] - start
+        along = arms @ way
+        away = np.linalg.norm(arms - along[:, None] * way, axis=1)
+        near = away[np.abs(along) <= length / 3.0]
+        return float(np.percentile(near if len(near) else away, 75.0))
 
     def near(joint: int, others: Iterable[int], limit: float) -> set[int]:
-        return {
-            f
-            for j in others
-            for f in of_joint[j]
-            if float(np.linalg.norm(middle[f] - places[joint])) <= limit
-        }
+        own = np.array([f for j in others for f in of_joint[j]], dtype=np.int64)
+        away = np.linalg.norm(middle[own] - places[joint], axis=1)
+        return set(own[away <= limit].tolist())
 
     thickness: dict[int, float] = {}
     found = []
