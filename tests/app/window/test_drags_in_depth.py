@@ -14,7 +14,7 @@ from pytestqt.qtbot import QtBot
 from app.editing.document import PoseDocument
 from app.view.camera import places_of
 from app.window.main_window import MainWindow
-from lcollision_core.bodies import open_body
+from lcollision_core.bodies import Body, open_body
 from tests.app.views import place_of, point_at, point_beside, roll, seen_vertex
 from tests.app.windows import (
     move_held,
@@ -28,14 +28,17 @@ from tests.app.windows import (
 LEFT, NO_KEY = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
 
 
+@pytest.fixture(scope="module")
+def mannequin(characters: Path) -> Body:
+    return open_body(characters / "mannequin-moves.glb")
+
+
 @pytest.fixture
 def stage(
-    qtbot: QtBot, tmp_path: Path, characters: Path, request: pytest.FixtureRequest
+    qtbot: QtBot, tmp_path: Path, mannequin: Body, request: pytest.FixtureRequest
 ) -> MainWindow:
     """Return a window of the mannequin, seen from the front, in a theme."""
-    document = PoseDocument(
-        open_body(characters / "mannequin-moves.glb"), library_folder=tmp_path / "library"
-    )
+    document = PoseDocument(mannequin, library_folder=tmp_path / "library")
     settings = settings_in(tmp_path)
     settings["theme"] = getattr(request, "param", "light")
     held = open_window(qtbot, document, settings, (1280, 860))
