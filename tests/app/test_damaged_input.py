@@ -12,6 +12,7 @@ import pickle
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -130,8 +131,12 @@ def _smpl(path: Path) -> None:
     assert np.isfinite(body.decode(np.zeros(body.latent_size))).all()
 
 
+_opened = lru_cache(maxsize=1)(open_body)
+"""Opens a sound body once for all damaged motions of a test."""
+
+
 def _walk(path: Path) -> None:
-    body, _ = body_of_motion(open_body(path.with_name("sound.npz")), path)
+    body, _ = body_of_motion(_opened(path.with_name("sound.npz")), path)
     (motion,) = read_motions(body, path)
     assert np.isfinite(motion.codes).all()
 

@@ -121,7 +121,7 @@ def test_anything_added_is_refused(path: Path) -> None:
 
 @pytest.mark.slow
 @settings(
-    max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(data=st.data())
 def test_damage_is_refused_or_harmless(path: Path, data: st.DataObject) -> None:

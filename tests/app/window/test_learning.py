@@ -136,6 +136,7 @@ def test_a_dropped_folder_of_meshes_is_learned_killed_continued_and_opened(
         window.document.motion.set_code(0, 0.3)
         rest(qtbot, window)
         os.kill(process_of(path), signal.SIGKILL)
+        monkeypatch.delenv("SECONDS_PER_STEP")
         qtbot.waitUntil(lambda: phase() is RunState.KILLED, timeout=PATIENCE)
         assert learning.indicator.property("state") == "failed"
         dialog = dialog_of(window)

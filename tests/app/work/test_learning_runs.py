@@ -89,7 +89,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="looks for the proces
 @pytest.mark.slow
 @linux
 def test_killed_in_the_middle_a_run_says_so_and_goes_on_to_its_end(
-    qtbot: QtBot, runs: LearningRuns, tube_file: Path
+    qtbot: QtBot, runs: LearningRuns, tube_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = begin(qtbot, runs, tube_file)
     wait_for(qtbot, runs, path, lambda run: run.status.stage != "poses")
@@ -100,6 +100,7 @@ def test_killed_in_the_middle_a_run_says_so_and_goes_on_to_its_end(
     killed = wait_for(qtbot, runs, path, lambda run: not run.is_active)
     assert killed.state == RunState.KILLED
     assert "stopped unexpectedly" in killed.status.sentence
+    monkeypatch.delenv("SECONDS_PER_STEP")
     runs.resume(path)
     done = wait_for(qtbot, runs, path, lambda run: not run.is_active)
     assert done.state == RunState.DONE, done.work.log.read_text()
@@ -138,8 +139,9 @@ def test_a_run_is_stopped_from_another_window_and_one_waits_for_another(
 
 @pytest.mark.slow
 def test_what_stopped_as_nearly_all_samples_collide_goes_on_regardless_once_it_is_continued(
-    qtbot: QtBot, runs: LearningRuns, tmp_path: Path
+    qtbot: QtBot, runs: LearningRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.delenv("SECONDS_PER_STEP")
     write_pose_set(tmp_path / "tubes.npz", two_tubes())
     request = LearningRequest((str(tmp_path / "tubes.npz"),), "quick", ignored=())
     path = runs.start(replace(request, near_exclusion=0.0), "hero")
