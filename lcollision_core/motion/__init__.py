@@ -22,5 +22,6 @@ from lcollision_core.motion.motion import (
     colliding_spans,
     standing_parts,
 )
-from lcollision_core.motion.resolve_motion import ResolvedMotion, Solved, resolve_motion
+from lcollision_core.motion.resolve_motion import ResolvedMotion, resolve_motion
+from lcollision_core.motion.spans import Solved
 from lcollision_core.options import MotionOptions

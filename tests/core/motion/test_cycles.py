@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from functools import cache
 
@@ -19,6 +18,7 @@ from lcollision_core.motion import (
     resolve_motion,
     screen_motion,
 )
+from lcollision_core.motion import spans as span_solver
 from tests.core.motion.swings import CLIP, swinging_body
 from tests.rigged_shapes import FloatArray
 
@@ -56,9 +56,8 @@ def bends(rows: FloatArray) -> FloatArray:
 def test_a_collision_at_the_seam_is_resolved_as_any_other(
     easing: int, window: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module = sys.modules[resolve_motion.__module__]
-    monkeypatch.setattr(module, "WINDOW", window)
-    monkeypatch.setattr(module, "OVERLAP", 10)
+    monkeypatch.setattr(span_solver, "WINDOW", window)
+    monkeypatch.setattr(span_solver, "OVERLAP", 10)
     body, motion = cycle()
     check = body.exact_check()
     kept: dict[int, Solved] = {}

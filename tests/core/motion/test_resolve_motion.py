@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from lcollision_core.motion import (
     resolve_motion,
     screen_motion,
 )
+from lcollision_core.motion import spans as span_solver
 from lcollision_core.motion.motion import knots_of, windows
 from lcollision_core.resolve import ResolveOptions
 from tests.core.motion.swings import CLIP, swinging, swinging_body, through_the_trunk
@@ -250,8 +250,8 @@ def test_a_run_that_is_to_end_keeps_the_windows_that_are_done(
     # Without its end it is not a cycle.
     codes = body.space.codes_of_transforms(frames.transforms[:76])
     motion = Motion(CLIP, frames.times[:76], codes)
-    monkeypatch.setattr(sys.modules[resolve_motion.__module__], "WINDOW", 44)
-    monkeypatch.setattr(sys.modules[resolve_motion.__module__], "OVERLAP", 8)
+    monkeypatch.setattr(span_solver, "WINDOW", 44)
+    monkeypatch.setattr(span_solver, "OVERLAP", 8)
     stop = Job()
 
     def keep(frame: int, solved: Solved) -> None:  # noqa: ARG001
