@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import os
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from msgspec import Meta
 
 from lcollision_core.acap.codec import BLOCK_POSES
+from lcollision_core.bodies.card import ModelCard
 from lcollision_core.bodies.mirror import (
     MirroredPose,
     MirrorSource,
@@ -27,7 +26,6 @@ from lcollision_core.bodies.mirror import (
     sorted_faces,
 )
 from lcollision_core.bodies.names import (
-    MAX_NAME_LENGTH,
     SHAPES,
     WHOLE_BODY,
     CodeEffect,
@@ -38,9 +36,7 @@ from lcollision_core.bodies.names import (
 )
 from lcollision_core.errors import LCollisionError, ModelFileError, PoseSetError, ShapeError
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
-from lcollision_core.json_values import from_json, quoted
 from lcollision_core.meshes import (
-    STRICT,
     ContactRules,
     FaceGroup,
     RigidTransform,
@@ -50,9 +46,6 @@ from lcollision_core.meshes import (
     with_named_groups,
 )
 from lcollision_core.meshes.face_groups import (
-    faces_to_runs,
-    require_groups,
-    runs_to_faces,
     touching_groups,
 )
 from lcollision_core.meshes.topology import FloatArray, latent_array
@@ -68,151 +61,6 @@ if TYPE_CHECKING:
     from lcollision_core.posing import ExactCheck, PoseDragger, PoseSpace
     from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
     from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
-
-
-LEAST_BODY_SIZE = 1e-12
-"""Least body size, in any unit; its inverse is the largest."""
-
-_MAX_TEXT_LENGTH = 1000
-_CARD = "the model's card"
-_ADVICE = "train or copy the model again"
-
-
-@dataclass(frozen=True)
-class _StoredGroup:
-    name: str
-    runs: tuple[int, ...]
-    about_joint: bool = False
-
-
-@dataclass(frozen=True)
-class _StoredRules:
-    """Contact rules in a card's JSON; older cards have the near exclusion only."""
-
-    near_exclusion: Annotated[float, Meta(ge=0.0, lt=1.0)]
-    rules: ContactRules = STRICT
-    groups: tuple[_StoredGroup, ...] = ()
-
-
-@dataclass(frozen=True)
-class ModelCard:
-    """Units, names and origin of a model.
-
-    Attributes
-    ----------
-    height : the body size, in the data's unit
-    up_axis : 0, 1 or 2 for x, y or z
-    domain_names : K unique names
-    domain_colours : K strings "#rrggbb"
-    pose_names : N names of the training poses
-    source : the data that the model was trained on
-    licence : of the model
-    provenance : how it was made, JSON values by name
-    domain_order : all K domains, indices from 0, in listing order; empty for the latent's order
-    rules : which pairs of faces do not count
-    groups : named groups of faces, pairs of which the rules may ignore
-    metres : length of the data's unit, 1 if unknown
-
-    Raises
-    ------
-    ModelFileError : an invalid value.
-    """
-
-    height: float
-    up_axis: int
-    domain_names: tuple[str, ...]
-    domain_colours: tuple[str, ...]
-    pose_names: tuple[str, ...]
-    source: str
-    licence: str
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    domain_order: tuple[int, ...] = ()
-    rules: ContactRules = STRICT
-    groups: tuple[FaceGroup, ...] = ()
-    metres: float = 1.0
-
-    def __post_init__(self) -> None:
-        names, order, largest = self.domain_names, self.domain_order, 1.0 / LEAST_BODY_SIZE
-        if not LEAST_BODY_SIZE <= self.height <= largest:
-            raise ModelFileError(
-                f"its body size (height) must be from {LEAST_BODY_SIZE:g} to {largest:g}"
-            )
-        if not 0.0 < self.metres < np.inf:
-            raise ModelFileError("its unit (metres) must be a number above 0")
-        if self.up_axis not in (0, 1, 2):
-            raise ModelFileError("its up_axis must be 0, 1 or 2")
-        if max(map(len, (*self.pose_names, self.source, self.licence))) > _MAX_TEXT_LENGTH:
-            raise ModelFileError(
-                f"its names, source and licence must be at most {_MAX_TEXT_LENGTH} characters"
-            )
-        for name in names:
-            if not 0 < len(name) <= MAX_NAME_LENGTH or not name.isprintable():
-                allowed = f"use 1 to {MAX_NAME_LENGTH} printable characters"
-                raise ModelFileError(f"{name[:80]!r} cannot name a domain", allowed)
-            if names.count(name) > 1:
-                raise ModelFileError(f"two domains would be called {name!r}", "choose another name")
-        if len(self.domain_colours) != len(names):
-            raise ModelFileError("it must have one colour for each domain")
-        for colour in self.domain_colours:
-            if not re.fullmatch("#[0-9a-f]{6}", colour):
-                raise ModelFileError(f"{quoted(colour)} is not a colour", "write it as in #0077bb")
-        if order and sorted(order) != list(range(len(names))):
-            what = f"{quoted(list(order))} is not an order of the {len(names)} domains"
-            raise ModelFileError(what, "name each once")
-
-    @property
-    def near_exclusion(self) -> float:
-        """Normalised distance along the surface within which pairs of faces do not count."""
-        return self.rules.near_exclusion
-
-    def to_metadata(self) -> dict[str, Any]:
-        """Return JSON values for `from_metadata`."""
-        values = asdict(replace(self, groups=()))
-        del values["rules"], values["groups"]
-        if not self.domain_order:
-            del values["domain_order"]
-        if self.metres == 1.0:
-            del values["metres"]
-        values["near_exclusion"] = self.near_exclusion
-        if self.rules != ContactRules(self.near_exclusion):
-            values["rules"] = self.rules.to_json()
-        if self.groups:
-            values["groups"] = [
-                {"name": group.name, "runs": faces_to_runs(group.faces).tolist()}
-                | ({"about_joint": True} if group.about_joint else {})
-                for group in self.groups
-            ]
-        return values
-
-    @classmethod
-    def from_metadata(cls, metadata: Mapping[str, Any], n_faces: int) -> ModelCard:
-        """Rebuild a card from the result of `to_metadata`.
-
-        Parameters
-        ----------
-        n_faces : of the model
-
-        Raises
-        ------
-        ModelFileError : a value is missing or invalid.
-        """
-        try:
-            stored = from_json(_StoredRules, metadata, "card")
-            groups = tuple(
-                FaceGroup(
-                    group.name,
-                    runs_to_faces(np.array(group.runs, dtype=np.int64), n_faces),
-                    group.about_joint,
-                )
-                for group in stored.groups
-            )
-            rules = replace(stored.rules, near_exclusion=stored.near_exclusion)
-            require_groups(rules, groups, n_faces)
-            others = {name: metadata[name] for name in metadata if name not in ("rules", "groups")}
-            return replace(from_json(cls, others, "card"), rules=rules, groups=groups)
-        except (ValueError, ModelFileError) as error:
-            reason = getattr(error, "headline", error)
-            raise ModelFileError.because(_CARD, "is damaged", reason, _ADVICE) from error
 
 
 @dataclass(frozen=True)
@@ -256,21 +104,20 @@ class Body(ABC):
     """
 
     notes: tuple[str, ...] = ()
-
     character: Character | None = None
     """The character of the file whose joints pose the body; None for a body without joints."""
     joints: RigPoseSpace | None = None
     """`space` if it is that of a rig's joints; None for a body without joints."""
     embedding: Embedding | None = None
     """The latent space of a learned body; None for others."""
-
     is_trained = False
     """Whether the pose space was learned from the poses that came with the body."""
     has_predictor = False
     """Whether a predictor was trained."""
+    no_predictor: tuple[str, str]
+    """Why there is no predictor, with a field for the body's name, and advice."""
     can_resolve = True
     """Whether colliding poses can be resolved."""
-
     shape_names: tuple[str, ...] = ()
     """S names of the last codes, the weights of morph targets; most bodies have none."""
     fixed_domains: frozenset[int] = frozenset()
@@ -279,6 +126,13 @@ class Body(ABC):
     """Normalised height of the ground and a (V,) mask of the other vertices; None without."""
     own_card: ModelCard | None = None
     """The card of a body whose file does not keep the user's choices, before any of them."""
+    has_unit = False
+    """Whether the data's unit is known even if the card's is a metre, as it is by default."""
+    no_sides = (
+        "its first pose is not symmetric, so left and right cannot be told apart",
+        "train a model whose first pose is symmetric",
+    )
+    """Why there is no `symmetry`, and advice."""
 
     def __init__(
         self,
@@ -294,6 +148,8 @@ class Body(ABC):
         self.attention_mask: npt.NDArray[np.float32] = read_only(attention_mask)
         self.known_poses: FloatArray = read_only(known_poses)
 
+    # Each kind of body defines these.
+
     @property
     @abstractmethod
     def space(self) -> PoseSpace:
@@ -308,49 +164,41 @@ class Body(ABC):
         anything trained on top of the pose space.
         """
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the body as a model file, atomically.
-
-        Raises
-        ------
-        ModelFileError : the body was not learned, or the file cannot be written.
-        """
-        raise ModelFileError(
-            f"cannot hold {self.name}, which is no learned model", "copy its own file", where=path
-        )
-
-    @property
-    def starter_poses(self) -> tuple[StarterPose, ...]:
-        """Poses to begin with; none unless the rig's joints are known."""
-        return ()
-
-    @property
-    def shape_codes(self) -> slice:
-        """Range of the shape codes in a pose."""
-        return slice(self.latent_size - len(self.shape_names), self.latent_size)
-
     @property
     @abstractmethod
     def code_effects(self) -> tuple[CodeEffect, ...]:
         """The effect of raising each of the D codes."""
 
     @property
-    def own_file(self) -> Path | None:
-        """The character's file; None for a body without joints."""
-        return None if self.character is None else self.character.source
+    @abstractmethod
+    def free_latent(self) -> FloatArray:
+        """(F, D) known collision-free poses, read-only."""
 
     @property
-    def own_clips(self) -> tuple[str, ...]:
-        """The names of the character's clips."""
-        return () if self.character is None else tuple(self.character.clips)
+    @abstractmethod
+    def resolver(self) -> PoseResolver:
+        """Resolves the self-collisions of this body's poses.
 
-    def without_ground(self, vertices: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return (..., V, 3) vertices without those of the ground, for fitting views."""
-        return vertices if self.ground is None else vertices[..., self.ground[1], :]
+        Raises
+        ------
+        ModelFileError : the body needs a predictor to resolve, and has none or a damaged one.
+        """
 
-    def is_of_file(self, path: str | os.PathLike[str]) -> bool:
-        """Return whether a path is `own_file`."""
-        return self.own_file is not None and self.own_file.absolute() == Path(path).absolute()
+    @abstractmethod
+    def _fit(self, vertices: FloatArray, job: Job, *, in_place: bool) -> LatentFit:
+        """Find the codes whose mesh is nearest to (V, 3) normalised vertices.
+
+        Parameters
+        ----------
+        in_place : whether the mesh is aligned with the reference and must not be moved
+        """
+
+    # Some kinds redefine these, and a few of those below.
+
+    @property
+    def starter_poses(self) -> tuple[StarterPose, ...]:
+        """Poses to begin with; none unless the rig's joints are known."""
+        return ()
 
     @property
     def appearance(self) -> Appearance | None:
@@ -377,104 +225,106 @@ class Body(ABC):
         """
         return None
 
-    def require_predictor(self) -> CollisionPredictor:
-        """Return the predictor.
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the body as a model file, atomically.
 
         Raises
         ------
-        ModelFileError : there is none, or it is damaged.
+        ModelFileError : the body was not learned, or the file cannot be written.
         """
-        predictor = self.predictor
-        if predictor is None:
-            reason, advice = self.no_predictor
-            raise ModelFileError(reason.format(name=self.name), advice)
-        return predictor
-
-    no_predictor: tuple[str, str]
-    """Why there is no predictor, with a field for the body's name, and advice."""
-
-    @property
-    @abstractmethod
-    def free_latent(self) -> FloatArray:
-        """(F, D) known collision-free poses, read-only."""
-
-    @property
-    @abstractmethod
-    def resolver(self) -> PoseResolver:
-        """Resolves the self-collisions of this body's poses.
-
-        Raises
-        ------
-        ModelFileError : the body needs a predictor to resolve, and has none or a damaged one.
-        """
-
-    @property
-    def prediction_needs_torch(self) -> bool:
-        """Whether predictions need torch; loads the predictor."""
-        return self.predictor is not None and self.predictor.needs_torch
-
-    def predict(self, latent: npt.ArrayLike) -> Prediction:
-        """Predict collisions and domain energies of poses, without decoding them.
-
-        Parameters
-        ----------
-        latent : (D,) or (B, D) finite array; one pose is a batch of 1
-
-        Raises
-        ------
-        ShapeError : wrong shape, or a number that is not finite.
-        ModelFileError : the body has no predictor, or a damaged one.
-        """
-        return self.require_predictor().predict(np.atleast_2d(self._checked(latent)))
-
-    def resolve(
-        self,
-        latent: npt.ArrayLike,
-        options: ResolveOptions | None = None,
-        job: Job = UNWATCHED,
-        placement: RigidTransform | None = None,
-    ) -> ResolveResult:
-        """Find the nearest collision-free pose.
-
-        Parameters
-        ----------
-        latent : (D,) finite array
-        options : solver, metric, locked domains and limits
-        job : reports (steps done, all steps); polled at every evaluation
-        placement : of the exported pose; the exact check uses the vertices there
-
-        Raises
-        ------
-        ShapeError : wrong shape, a number that is not finite or a wrong number of weights.
-        LCollisionError : an unknown locked domain.
-        ModelFileError : the body needs a predictor to resolve, and has none or a damaged one.
-        CancelledError : the job was cancelled.
-        """
-        return self.resolver.resolve(latent, options, job, placement)
-
-    @abstractmethod
-    def _fit(self, vertices: FloatArray, job: Job, *, in_place: bool) -> LatentFit:
-        """Find the codes whose mesh is nearest to (V, 3) normalised vertices.
-
-        Parameters
-        ----------
-        in_place : whether the mesh is aligned with the reference and must not be moved
-        """
+        raise ModelFileError(
+            f"cannot hold {self.name}, which is no learned model", "copy its own file", where=path
+        )
 
     @property
     def _decoder(self) -> Callable[[FloatArray], FloatArray]:
         """Decoder of (B, D) codes to (B, V, 3) normalised vertices, on the calling thread."""
         return self.space.decode
 
+    def _drawn(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
+        return self.latent_space.sample(n_poses, generator)
+
+    def _vertex_labels(self) -> npt.NDArray[np.str_] | None:
+        """Return (V,) names of body parts that groups are named after, None if unknown."""
+        return None
+
+    # Its size, file and parts.
+
     @property
-    def block_decoder(self) -> Callable[[FloatArray], FloatArray]:
-        """Decoder of (B, D) codes as in `decode`, on the calling thread.
+    def body_size(self) -> float:
+        """The body size in the data's unit; lengths are normalised by it."""
+        return self.card.height
 
-        Everything it needs is built here, so that several threads do not build it at once.
-        """
-        decode, height = self._decoder, self.card.height
+    @property
+    def known_metres(self) -> float | None:
+        """Length of the data's unit in metres; None if unknown."""
+        return self.card.metres if self.has_unit or self.card.metres != 1.0 else None
 
-        return lambda codes: decode(codes) * height
+    @property
+    def up_axis(self) -> int:
+        """0, 1 or 2 for x, y or z."""
+        return self.card.up_axis
+
+    @property
+    def up(self) -> tuple[float, float, float]:
+        """Unit vector along the up axis."""
+        x, y, z = (float(axis == self.up_axis) for axis in range(3))
+        return x, y, z
+
+    @cached_property
+    def front(self) -> FloatArray:
+        """(3,) unit vector along an axis: where the reference faces, guessed from its shape."""
+        return read_only(front_direction(self.reference, self.up_axis))
+
+    @property
+    def faces(self) -> npt.NDArray[np.int32]:
+        """(F, 3) int32 array, vertex indices from 0, read-only."""
+        return self.topology.faces
+
+    @property
+    def n_vertices(self) -> int:
+        """V."""
+        return self.topology.n_vertices
+
+    @property
+    def latent_size(self) -> int:
+        """D, the number of a latent pose's codes."""
+        return len(self.space.low)
+
+    @property
+    def shape_codes(self) -> slice:
+        """Range of the shape codes in a pose."""
+        return slice(self.latent_size - len(self.shape_names), self.latent_size)
+
+    @property
+    def domain_names(self) -> tuple[str, ...]:
+        """K unique names."""
+        return self.card.domain_names
+
+    @property
+    def domain_order(self) -> tuple[int, ...]:
+        """All K domains, indices from 0, in listing order."""
+        return self.card.domain_order or tuple(range(len(self.domain_names)))
+
+    @property
+    def own_file(self) -> Path | None:
+        """The character's file; None for a body without joints."""
+        return None if self.character is None else self.character.source
+
+    @property
+    def own_clips(self) -> tuple[str, ...]:
+        """The names of the character's clips."""
+        return () if self.character is None else tuple(self.character.clips)
+
+    def is_of_file(self, path: str | os.PathLike[str]) -> bool:
+        """Return whether a path is `own_file`."""
+        return self.own_file is not None and self.own_file.absolute() == Path(path).absolute()
+
+    def without_ground(self, vertices: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return (..., V, 3) vertices without those of the ground, for fitting views."""
+        return vertices if self.ground is None else vertices[..., self.ground[1], :]
+
+    # Poses and meshes.
 
     def decode(self, latent: npt.ArrayLike, n_threads: int | None = None) -> FloatArray:
         """Turn latent poses into meshes.
@@ -504,6 +354,16 @@ class Body(ABC):
         for_blocks(fill, len(rows), BLOCK_POSES, n_threads)
         return vertices[0] if codes.ndim == 1 else vertices
 
+    @property
+    def block_decoder(self) -> Callable[[FloatArray], FloatArray]:
+        """Decoder of (B, D) codes as in `decode`, on the calling thread.
+
+        Everything it needs is built here, so that several threads do not build it at once.
+        """
+        decode, height = self._decoder, self.card.height
+
+        return lambda codes: decode(codes) * height
+
     def exported_vertices(
         self, latent: npt.ArrayLike, placement: RigidTransform | None = None
     ) -> npt.NDArray[np.floating]:
@@ -516,61 +376,6 @@ class Body(ABC):
         from lcollision_core.posing import exported_vertices
 
         return exported_vertices(self.decode(latent, n_threads=1), placement)
-
-    def exact_check(
-        self,
-        placement: RigidTransform | None = None,
-        space: PoseSpace | None = None,
-        clearance: float = 0.0,
-    ) -> ExactCheck:
-        """Return the exact check of poses placed for export.
-
-        Parameters
-        ----------
-        space : the body as it is in a frame, by default `self.space`
-        clearance : normalised, to keep between parts of collision-free poses
-        """
-        from lcollision_core.posing import ExactCheck
-
-        detector = self.detector.with_clearance(clearance)
-        return ExactCheck(space or self.space, detector, self.body_size, placement)
-
-    def dragger(
-        self,
-        placement: RigidTransform | None = None,
-        space: PoseSpace | None = None,
-    ) -> PoseDragger:
-        """Return a dragger for poses of `exact_check`; use it from one thread at a time."""
-        from lcollision_core.posing import PoseDragger
-
-        return PoseDragger(self.exact_check(placement, space), np.eye(3)[self.up_axis])
-
-    def mirror(
-        self,
-        latent: npt.ArrayLike,
-        placement: RigidTransform | None = None,
-        source: MirrorSource | None = None,
-        options: ResolveOptions | None = None,
-        job: Job = UNWATCHED,
-    ) -> MirroredPose:
-        """Exchange left and right of a pose: see `PoseMirror.mirror`.
-
-        Parameters
-        ----------
-        latent : (D,) finite array
-        placement, source, options, job : see there
-
-        Raises
-        ------
-        ShapeError : wrong shape, or a number that is not finite.
-        LCollisionError : the model is not symmetric, or a locked domain is unknown.
-        ModelFileError : the model's predictor is damaged.
-        CancelledError : the job was cancelled.
-        """
-        pose = self._checked(latent)
-        if pose.ndim != 1:
-            raise ShapeError("one pose is mirrored at a time", got=f"shape {pose.shape}")
-        return self.pose_mirror.mirror(pose, placement, source, options, job)
 
     def encode(
         self, vertices: npt.ArrayLike, job: Job = UNWATCHED, scale: float = 1.0
@@ -644,43 +449,6 @@ class Body(ABC):
                 where=source,
             )
 
-    def edit_domains(
-        self,
-        names: Mapping[int, str] | None = None,
-        colours: Mapping[int, str] | None = None,
-        order: Sequence[int] | None = None,
-    ) -> Self:
-        """Return the same model with other domain names, colours or listing order.
-
-        Parameters
-        ----------
-        names : new names by domain, an index from 0; two domains may swap theirs
-        colours : new colours "#rrggbb" by domain
-        order : all domains in listing order; the order of the latent entries does not change
-
-        Raises
-        ------
-        ModelFileError : an unknown domain, an invalid or duplicate name, or an invalid colour or
-            order.
-        """
-        renamed, coloured = list(self.domain_names), list(self.card.domain_colours)
-        for values, changes in ((renamed, names or {}), (coloured, colours or {})):
-            for domain, value in changes.items():
-                if not 0 <= domain < len(values):
-                    raise ModelFileError(
-                        f"{self.name} has no domain {domain + 1}",
-                        f"its domains are 1 to {len(values)}",
-                    )
-                values[domain] = value.strip() if values is renamed else value.lower()
-        return self.with_card(
-            replace(
-                self.card,
-                domain_names=tuple(renamed),
-                domain_colours=tuple(coloured),
-                domain_order=self.card.domain_order if order is None else tuple(order),
-            )
-        )
-
     def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
         """Draw (n_poses, D) poses uniformly from the box of the codes' ranges.
 
@@ -701,28 +469,219 @@ class Body(ABC):
             raise LCollisionError.must_be("the generator", expected, repr(given))
         return self._drawn(n_poses, generator)
 
-    def _drawn(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
-        return self.latent_space.sample(n_poses, generator)
+    def _checked(self, latent: npt.ArrayLike) -> FloatArray:
+        codes = latent_array(latent).astype(np.float64)
+        if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
+            raise ShapeError.must_be(
+                f"a latent pose of {self.name}",
+                f"{self.latent_size} numbers",
+                f"shape {codes.shape}",
+            )
+        if not np.isfinite(codes).all():
+            raise ShapeError("a latent pose has a number that is not finite")
+        return codes
 
-    def with_card(self, card: ModelCard, name: str | None = None) -> Self:
-        """Return the same model with another card; computed properties are kept.
+    # Checking, resolving and predicting poses.
+
+    @cached_property
+    def detector(self) -> CollisionDetector:
+        """Finds exact self-collisions of this model's meshes, in the data's unit."""
+        from lcollision_core.contact import CollisionDetector
+
+        return CollisionDetector(self.topology, self.reference, self.rules, self.groups)
+
+    def exact_check(
+        self,
+        placement: RigidTransform | None = None,
+        space: PoseSpace | None = None,
+        clearance: float = 0.0,
+    ) -> ExactCheck:
+        """Return the exact check of poses placed for export.
 
         Parameters
         ----------
-        card : names, colours or order may differ; units and poses are the same
-        name : the new name of the model, by default the same
+        space : the body as it is in a frame, by default `self.space`
+        clearance : normalised, to keep between parts of collision-free poses
         """
-        other = copy(self)
-        other.card, other.name = card, name or self.name
-        for cached in ("latent_space", "code_names", "code_words"):
-            other.__dict__.pop(cached, None)
-        return other
+        from lcollision_core.posing import ExactCheck
 
-    def noted(self, sentence: str) -> Self:
-        """Return the same body with one more note."""
-        other = self.with_card(self.card)
-        other.notes = (*self.notes, sentence)
-        return other
+        detector = self.detector.with_clearance(clearance)
+        return ExactCheck(space or self.space, detector, self.body_size, placement)
+
+    def dragger(
+        self,
+        placement: RigidTransform | None = None,
+        space: PoseSpace | None = None,
+    ) -> PoseDragger:
+        """Return a dragger for poses of `exact_check`; use it from one thread at a time."""
+        from lcollision_core.posing import PoseDragger
+
+        return PoseDragger(self.exact_check(placement, space), np.eye(3)[self.up_axis])
+
+    def resolve(
+        self,
+        latent: npt.ArrayLike,
+        options: ResolveOptions | None = None,
+        job: Job = UNWATCHED,
+        placement: RigidTransform | None = None,
+    ) -> ResolveResult:
+        """Find the nearest collision-free pose.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        options : solver, metric, locked domains and limits
+        job : reports (steps done, all steps); polled at every evaluation
+        placement : of the exported pose; the exact check uses the vertices there
+
+        Raises
+        ------
+        ShapeError : wrong shape, a number that is not finite or a wrong number of weights.
+        LCollisionError : an unknown locked domain.
+        ModelFileError : the body needs a predictor to resolve, and has none or a damaged one.
+        CancelledError : the job was cancelled.
+        """
+        return self.resolver.resolve(latent, options, job, placement)
+
+    def predict(self, latent: npt.ArrayLike) -> Prediction:
+        """Predict collisions and domain energies of poses, without decoding them.
+
+        Parameters
+        ----------
+        latent : (D,) or (B, D) finite array; one pose is a batch of 1
+
+        Raises
+        ------
+        ShapeError : wrong shape, or a number that is not finite.
+        ModelFileError : the body has no predictor, or a damaged one.
+        """
+        return self.require_predictor().predict(np.atleast_2d(self._checked(latent)))
+
+    def require_predictor(self) -> CollisionPredictor:
+        """Return the predictor.
+
+        Raises
+        ------
+        ModelFileError : there is none, or it is damaged.
+        """
+        predictor = self.predictor
+        if predictor is None:
+            reason, advice = self.no_predictor
+            raise ModelFileError(reason.format(name=self.name), advice)
+        return predictor
+
+    @property
+    def prediction_needs_torch(self) -> bool:
+        """Whether predictions need torch; loads the predictor."""
+        return self.predictor is not None and self.predictor.needs_torch
+
+    # Mirroring poses.
+
+    @cached_property
+    def symmetry(self) -> Symmetry | None:
+        """Symmetry of the mesh; None if the reference is not nearly its own mirror image."""
+        return find_symmetry(self.reference, self.topology, self.up_axis)
+
+    @property
+    def why_not_mirrored(self) -> str:
+        """Why poses cannot be mirrored; "" if they can."""
+        return "" if self.symmetry is not None else f"Cannot be mirrored: {self.no_sides[0]}"
+
+    def mirror(
+        self,
+        latent: npt.ArrayLike,
+        placement: RigidTransform | None = None,
+        source: MirrorSource | None = None,
+        options: ResolveOptions | None = None,
+        job: Job = UNWATCHED,
+    ) -> MirroredPose:
+        """Exchange left and right of a pose: see `PoseMirror.mirror`.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        placement, source, options, job : see there
+
+        Raises
+        ------
+        ShapeError : wrong shape, or a number that is not finite.
+        LCollisionError : the model is not symmetric, or a locked domain is unknown.
+        ModelFileError : the model's predictor is damaged.
+        CancelledError : the job was cancelled.
+        """
+        pose = self._checked(latent)
+        if pose.ndim != 1:
+            raise ShapeError("one pose is mirrored at a time", got=f"shape {pose.shape}")
+        return self.pose_mirror.mirror(pose, placement, source, options, job)
+
+    @cached_property
+    def pose_mirror(self) -> PoseMirror:
+        """Mirrors this model's poses.
+
+        Raises
+        ------
+        LCollisionError : the mesh is not symmetric.
+        ModelFileError : the model's predictor is damaged.
+        """
+        return PoseMirror(*self._mirror_parts())
+
+    def _mirror_parts(
+        self,
+    ) -> tuple[
+        npt.NDArray[np.float32],
+        Symmetry,
+        ExactCheck,
+        Callable[[FloatArray, Job], FloatArray],
+        Callable[..., ResolveResult] | None,
+    ]:
+        """Return the arguments of `PoseMirror`; raise as `pose_mirror`."""
+        if self.symmetry is None:
+            reason, next_step = self.no_sides
+            where = f"poses of {self.name}"
+            raise LCollisionError(f"cannot be mirrored: {reason}", next_step, where=where)
+        resolve = self.resolve if self.can_resolve else None
+        return self.attention_mask, self.symmetry, self.exact_check(), self.nearest, resolve
+
+    # Contact rules.
+
+    @property
+    def rules(self) -> ContactRules:
+        """Which pairs of faces do not count."""
+        return self.card.rules
+
+    @property
+    def own_rules(self) -> ContactRules:
+        """The rules in the body's file, or the initial ones of a character or a scene."""
+        return self.rules if self.own_card is None else self.own_card.rules
+
+    @property
+    def rules_are_chosen(self) -> bool:
+        """Whether the user has chosen other rules, which the body's file does not keep."""
+        return self.rules != self.own_rules
+
+    @property
+    def groups(self) -> tuple[FaceGroup, ...]:
+        """Named groups of faces, pairs of which the rules may ignore."""
+        return self.card.groups
+
+    @property
+    def has_joints(self) -> bool:
+        """Whether the rules may exclude pairs at joints."""
+        return any(group.about_joint for group in self.groups)
+
+    @cached_property
+    def groups_by_kind(self) -> dict[str, tuple[FaceGroup, ...]]:
+        """All groups that the rules may ignore pairs of, by each of `GROUP_KINDS`."""
+        return groups_by_kind(self.groups, self.topology, self._vertex_labels())
+
+    @property
+    def _nameable_groups(self) -> list[FaceGroup]:
+        """All groups of `groups_by_kind`, and the domains whose names differ from theirs."""
+        groups = [group for kind in self.groups_by_kind.values() for group in kind]
+        named, owner = {group.name for group in groups}, self.space.vertex_domain[self.faces[:, 0]]
+        parts = enumerate(self.domain_names)
+        domains = ((name, np.flatnonzero(owner == k)) for k, name in parts if name not in named)
+        return groups + [FaceGroup(name, faces) for name, faces in domains]
 
     def with_rules(self, rules: ContactRules) -> Self:
         """Return the same model with other contact rules, validated on use.
@@ -735,20 +694,6 @@ class Body(ABC):
         ModelFileError : a predictor depends on the present rules.
         """
         return self._ruled(rules)
-
-    def _ruled(self, rules: ContactRules) -> Self:
-        kinds = {"any": self._nameable_groups} if rules.named_groups else {}
-        groups = with_named_groups(self.groups, kinds, rules.named_groups)
-        card = replace(self.card, rules=rules, groups=groups)
-        return self._with_detector(card, self.detector.with_rules(rules, groups))
-
-    def _with_detector(self, card: ModelCard, detector: CollisionDetector) -> Self:
-        """Return the same model with another card and detector, and without stale caches."""
-        other = self.with_card(card)
-        for cached in ("pose_mirror", "resolver", "free_latent"):
-            other.__dict__.pop(cached, None)
-        other.__dict__["detector"] = detector
-        return other
 
     def with_options(self, options: RuleOptions) -> Self:
         """Return the same model with these options added to its rules; itself if none are given.
@@ -785,70 +730,21 @@ class Body(ABC):
         pairs = touching_groups(entries, self._nameable_groups)
         return self._with_detector(self.card, self.detector.with_touching(pairs))
 
-    @property
-    def _nameable_groups(self) -> list[FaceGroup]:
-        """All groups of `groups_by_kind`, and the domains whose names differ from theirs."""
-        groups = [group for kind in self.groups_by_kind.values() for group in kind]
-        named, owner = {group.name for group in groups}, self.space.vertex_domain[self.faces[:, 0]]
-        parts = enumerate(self.domain_names)
-        domains = ((name, np.flatnonzero(owner == k)) for k, name in parts if name not in named)
-        return groups + [FaceGroup(name, faces) for name, faces in domains]
+    def _ruled(self, rules: ContactRules) -> Self:
+        kinds = {"any": self._nameable_groups} if rules.named_groups else {}
+        groups = with_named_groups(self.groups, kinds, rules.named_groups)
+        card = replace(self.card, rules=rules, groups=groups)
+        return self._with_detector(card, self.detector.with_rules(rules, groups))
 
-    def _checked(self, latent: npt.ArrayLike) -> FloatArray:
-        codes = latent_array(latent).astype(np.float64)
-        if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
-            raise ShapeError.must_be(
-                f"a latent pose of {self.name}",
-                f"{self.latent_size} numbers",
-                f"shape {codes.shape}",
-            )
-        if not np.isfinite(codes).all():
-            raise ShapeError("a latent pose has a number that is not finite")
-        return codes
+    def _with_detector(self, card: ModelCard, detector: CollisionDetector) -> Self:
+        """Return the same model with another card and detector, and without stale caches."""
+        other = self.with_card(card)
+        for cached in ("pose_mirror", "resolver", "free_latent"):
+            other.__dict__.pop(cached, None)
+        other.__dict__["detector"] = detector
+        return other
 
-    @cached_property
-    def symmetry(self) -> Symmetry | None:
-        """Symmetry of the mesh; None if the reference is not nearly its own mirror image."""
-        return find_symmetry(self.reference, self.topology, self.up_axis)
-
-    no_sides = (
-        "its first pose is not symmetric, so left and right cannot be told apart",
-        "train a model whose first pose is symmetric",
-    )
-    """Why there is no `symmetry`, and advice."""
-
-    @property
-    def why_not_mirrored(self) -> str:
-        """Why poses cannot be mirrored; "" if they can."""
-        return "" if self.symmetry is not None else f"Cannot be mirrored: {self.no_sides[0]}"
-
-    def _mirror_parts(
-        self,
-    ) -> tuple[
-        npt.NDArray[np.float32],
-        Symmetry,
-        ExactCheck,
-        Callable[[FloatArray, Job], FloatArray],
-        Callable[..., ResolveResult] | None,
-    ]:
-        """Return the arguments of `PoseMirror`; raise as `pose_mirror`."""
-        if self.symmetry is None:
-            reason, next_step = self.no_sides
-            where = f"poses of {self.name}"
-            raise LCollisionError(f"cannot be mirrored: {reason}", next_step, where=where)
-        resolve = self.resolve if self.can_resolve else None
-        return self.attention_mask, self.symmetry, self.exact_check(), self.nearest, resolve
-
-    @cached_property
-    def pose_mirror(self) -> PoseMirror:
-        """Mirrors this model's poses.
-
-        Raises
-        ------
-        LCollisionError : the mesh is not symmetric.
-        ModelFileError : the model's predictor is damaged.
-        """
-        return PoseMirror(*self._mirror_parts())
+    # Names.
 
     @cached_property
     def latent_space(self) -> LatentSpace:
@@ -897,100 +793,62 @@ class Body(ABC):
             words = [f"{text} finger thumb" if "hand" in text else text for text in words]
         return tuple(words)
 
-    @cached_property
-    def detector(self) -> CollisionDetector:
-        """Finds exact self-collisions of this model's meshes, in the data's unit."""
-        from lcollision_core.contact import CollisionDetector
+    def edit_domains(
+        self,
+        names: Mapping[int, str] | None = None,
+        colours: Mapping[int, str] | None = None,
+        order: Sequence[int] | None = None,
+    ) -> Self:
+        """Return the same model with other domain names, colours or listing order.
 
-        return CollisionDetector(self.topology, self.reference, self.rules, self.groups)
+        Parameters
+        ----------
+        names : new names by domain, an index from 0; two domains may swap theirs
+        colours : new colours "#rrggbb" by domain
+        order : all domains in listing order; the order of the latent entries does not change
 
-    @property
-    def faces(self) -> npt.NDArray[np.int32]:
-        """(F, 3) int32 array, vertex indices from 0, read-only."""
-        return self.topology.faces
+        Raises
+        ------
+        ModelFileError : an unknown domain, an invalid or duplicate name, or an invalid colour or
+            order.
+        """
+        renamed, coloured = list(self.domain_names), list(self.card.domain_colours)
+        for values, changes in ((renamed, names or {}), (coloured, colours or {})):
+            for domain, value in changes.items():
+                if not 0 <= domain < len(values):
+                    raise ModelFileError(
+                        f"{self.name} has no domain {domain + 1}",
+                        f"its domains are 1 to {len(values)}",
+                    )
+                values[domain] = value.strip() if values is renamed else value.lower()
+        return self.with_card(
+            replace(
+                self.card,
+                domain_names=tuple(renamed),
+                domain_colours=tuple(coloured),
+                domain_order=self.card.domain_order if order is None else tuple(order),
+            )
+        )
 
-    @property
-    def n_vertices(self) -> int:
-        """V."""
-        return self.topology.n_vertices
+    def with_card(self, card: ModelCard, name: str | None = None) -> Self:
+        """Return the same model with another card; computed properties are kept.
 
-    @property
-    def latent_size(self) -> int:
-        """D, the number of a latent pose's codes."""
-        return len(self.space.low)
+        Parameters
+        ----------
+        card : names, colours or order may differ; units and poses are the same
+        name : the new name of the model, by default the same
+        """
+        other = copy(self)
+        other.card, other.name = card, name or self.name
+        for cached in ("latent_space", "code_names", "code_words"):
+            other.__dict__.pop(cached, None)
+        return other
 
-    has_unit = False
-    """Whether the data's unit is known even if the card's is a metre, as it is by default."""
-
-    @property
-    def known_metres(self) -> float | None:
-        """Length of the data's unit in metres; None if unknown."""
-        return self.card.metres if self.has_unit or self.card.metres != 1.0 else None
-
-    @property
-    def body_size(self) -> float:
-        """The body size in the data's unit; lengths are normalised by it."""
-        return self.card.height
-
-    @property
-    def up_axis(self) -> int:
-        """0, 1 or 2 for x, y or z."""
-        return self.card.up_axis
-
-    @property
-    def up(self) -> tuple[float, float, float]:
-        """Unit vector along the up axis."""
-        x, y, z = (float(axis == self.up_axis) for axis in range(3))
-        return x, y, z
-
-    @cached_property
-    def front(self) -> FloatArray:
-        """(3,) unit vector along an axis: where the reference faces, guessed from its shape."""
-        return read_only(front_direction(self.reference, self.up_axis))
-
-    @property
-    def rules(self) -> ContactRules:
-        """Which pairs of faces do not count."""
-        return self.card.rules
-
-    @property
-    def own_rules(self) -> ContactRules:
-        """The rules in the body's file, or the initial ones of a character or a scene."""
-        return self.rules if self.own_card is None else self.own_card.rules
-
-    @property
-    def rules_are_chosen(self) -> bool:
-        """Whether the user has chosen other rules, which the body's file does not keep."""
-        return self.rules != self.own_rules
-
-    @property
-    def groups(self) -> tuple[FaceGroup, ...]:
-        """Named groups of faces, pairs of which the rules may ignore."""
-        return self.card.groups
-
-    @property
-    def has_joints(self) -> bool:
-        """Whether the rules may exclude pairs at joints."""
-        return any(group.about_joint for group in self.groups)
-
-    @cached_property
-    def groups_by_kind(self) -> dict[str, tuple[FaceGroup, ...]]:
-        """All groups that the rules may ignore pairs of, by each of `GROUP_KINDS`."""
-        return groups_by_kind(self.groups, self.topology, self._vertex_labels())
-
-    def _vertex_labels(self) -> npt.NDArray[np.str_] | None:
-        """Return (V,) names of body parts that groups are named after, None if unknown."""
-        return None
-
-    @property
-    def domain_names(self) -> tuple[str, ...]:
-        """K unique names."""
-        return self.card.domain_names
-
-    @property
-    def domain_order(self) -> tuple[int, ...]:
-        """All K domains, indices from 0, in listing order."""
-        return self.card.domain_order or tuple(range(len(self.domain_names)))
+    def noted(self, sentence: str) -> Self:
+        """Return the same body with one more note."""
+        other = self.with_card(self.card)
+        other.notes = (*self.notes, sentence)
+        return other
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:

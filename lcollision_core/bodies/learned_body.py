@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.bodies.body import Body, ModelCard, read_only
+from lcollision_core.bodies.body import Body, read_only
+from lcollision_core.bodies.card import ModelCard
 from lcollision_core.bodies.names import (
     CodeEffect,
     code_effects,

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.bodies.body import LEAST_BODY_SIZE, Body, ModelCard
+from lcollision_core.bodies.body import Body
+from lcollision_core.bodies.card import LEAST_BODY_SIZE, ModelCard
 from lcollision_core.bodies.names import CodeEffect
 from lcollision_core.contact import STRICT, CollisionDetector, ContactRules
 from lcollision_core.embedding.bilevel import LatentFit

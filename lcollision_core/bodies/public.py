@@ -1,6 +1,7 @@
 """The public names of `lcollision_core.bodies`, loaded on first use."""
 
-from lcollision_core.bodies.body import Body, EncodedPose, ModelCard
+from lcollision_core.bodies.body import Body, EncodedPose
+from lcollision_core.bodies.card import ModelCard
 from lcollision_core.bodies.export import (
     EXPORT_FORMS,
     ExportForm,

@@ -15,7 +15,8 @@ import numpy.typing as npt
 import scipy
 
 from lcollision_core.bodies.anatomy import ROLE_NAMES, joint_parts
-from lcollision_core.bodies.body import Body, ModelCard, read_only
+from lcollision_core.bodies.body import Body, read_only
+from lcollision_core.bodies.card import ModelCard
 from lcollision_core.bodies.mirror import (
     JointSides,
     PoseMirror,

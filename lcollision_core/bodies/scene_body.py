@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from lcollision_core.bodies.body import Body, ModelCard, read_only
+from lcollision_core.bodies.body import Body, read_only
+from lcollision_core.bodies.card import ModelCard
 from lcollision_core.bodies.mirror import PoseMirror, Symmetry
 from lcollision_core.bodies.names import (
     BETWEEN_BODIES,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import LearnedBody
-from lcollision_core.bodies.body import ModelCard
+from lcollision_core.bodies.card import ModelCard
 from lcollision_core.bundled import bundled_file
 from lcollision_core.errors import ModelFileError, ShapeError
 from lcollision_core.meshes import ContactRules, FaceGroup
