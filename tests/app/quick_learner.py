@@ -22,6 +22,7 @@ EFFORTS.update(
             ),
             256,
             replace(PRESETS["paper"], epochs=2, average_passes=0.0),
+            n_judged=40,
         ),
     )
 )

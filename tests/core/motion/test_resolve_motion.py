@@ -129,8 +129,8 @@ def test_an_arm_that_passes_through_the_trunk_between_two_free_frames_goes_round
     assert resolve_motion(body.resolver, motion, UP, OPTIONS, within=range(14)).spans == ()
 
 
-# 2 and 5 take the longest ways.
-@pytest.mark.parametrize("seed", [2, 4, 5])
+# The shortest and the longest of six.
+@pytest.mark.parametrize("seed", [4, 5])
 def test_noise_in_a_real_clip_leads_to_as_good_a_motion(characters: Path, seed: int) -> None:
     source = characters / "mannequin-moves.glb"
     body = open_body(source)

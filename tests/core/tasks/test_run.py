@@ -33,6 +33,7 @@ SMALL = Effort(
     ),
     256,
     replace(PRESETS["default"], epochs=2),
+    n_judged=40,
 )
 
 
