@@ -28,6 +28,11 @@ def counted(number: int, noun: str, nouns: str) -> str:
     return f"{number} {CATALOGUE.ngettext(noun, nouns, number)}"
 
 
+def both(first: str, second: str) -> str:
+    """Name two things, or one that is both."""
+    return first if first == second else say("{first} and {second}", first=first, second=second)
+
+
 def marked(sentence: str) -> str:
     """Return a sentence as it is, which `say` translates later."""
     return sentence

@@ -9,7 +9,7 @@ import typer
 from app.cli.console import JsonOption, note, print_json, progress_bar, tell
 from app.cli.options import ModelArgument, takes_options
 from lcollision_core.options import RuleOptions
-from lcollision_core.tasks.words import counted, say_number
+from lcollision_core.tasks.words import counted, say, say_number
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, ProposedRules
@@ -56,8 +56,10 @@ def contacts(
     if as_json:
         print_json({"name": body.name, **rules_json(body), "proposed": _proposed_json(proposed)})
         return
-    sentence = rules_sentence(body.rules, excluded_at_rest(body))
-    tell(f"{body.name}: {'every pair counts' if body.rules.exclude_nothing else sentence}")
+    if body.rules.exclude_nothing:
+        tell(say("{body}: every pair counts", body=body.name))
+    else:
+        tell(f"{body.name}: {rules_sentence(body.rules, excluded_at_rest(body))}")
     if proposed is not None:
         fields = {
             "poses": counted(proposed.n_poses, "sampled pose", "sampled poses"),

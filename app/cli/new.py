@@ -12,9 +12,9 @@ from app.cli.evaluate import kind_lines
 from app.cli.models import note_if_hiding
 from app.cli.options import DeviceOption, ModelOutput, takes_options
 from lcollision_core.devices import Device, choose_device
-from lcollision_core.errors import CancelledError, LCollisionError
+from lcollision_core.errors import CancelledError, LCollisionError, listed
 from lcollision_core.options import LearningRequest
-from lcollision_core.tasks.words import duration_text, scores_text, spent_text
+from lcollision_core.tasks.words import duration_text, say, scores_text, spent_text
 
 if TYPE_CHECKING:
     from app.cli.console import BarContent
@@ -103,9 +103,12 @@ def _print(card: LearnedCard) -> None:
     for line in kind_lines(card.kinds):
         tell(f"    {line}")
     tell(
-        f"  {100.0 * card.colliding_share:.1f} % of random poses collide; {card.samples} samples "
-        "were labelled; "
-        + ", ".join(f"{stage} {spent_text(spent)}" for stage, spent in card.seconds.items())
+        say(
+            "  {share:.1f} % of random poses collide; {samples} samples were labelled; {times}",
+            share=100.0 * card.colliding_share,
+            samples=card.samples,
+            times=listed(f"{stage} {spent_text(spent)}" for stage, spent in card.seconds.items()),
+        )
     )
 
 

@@ -11,7 +11,7 @@ from app.cli.console import ExitStatus, JsonOption, cancellable_bar, print_json,
 from app.cli.options import ModelArgument, ScaleOption, takes_options
 from lcollision_core.errors import LCollisionError, listed
 from lcollision_core.options import NO_SCENE, PrintOptions, RuleOptions
-from lcollision_core.tasks.words import counted, printed_text
+from lcollision_core.tasks.words import counted, printed_text, say
 
 
 @takes_options
@@ -65,9 +65,11 @@ def print_figure(
             raise typer.Exit(ExitStatus.BAD_INPUT)
         matching = [given_pose.pose for given_pose in given if name in (None, given_pose.pose.name)]
         if len(matching) != 1:
-            poses = counted(len(matching), "pose", "poses") if matching else "no pose"
+            poses = counted(len(matching), "pose", "poses") if matching else say("no pose")
             raise LCollisionError(
-                f"has {poses}{'' if name is None else f' named {name!r}'}",
+                say("has {poses}", poses=poses)
+                if name is None
+                else say("has {poses} named {name!r}", poses=poses, name=name),
                 f"name one by --pose: {listed(item.pose.name for item in given)}",
                 where=pose,
             )

@@ -207,10 +207,15 @@ def indicator_text(run: LearningRun) -> str:
     """Describe the progress of a run in one line."""
     name, status = one_line(run.name), run.status
     if run.state == RunState.RUNNING:
-        words = [f"Learning {name}: {100 * status.done:.0f} %"]
-        if status.seconds_left is not None and status.done > 0.0:
-            words.append(f"{duration_text(status.seconds_left)} left")
-        return ", ".join((*words, STAGE_WORDS.get(status.stage, status.stage)))
+        fields = {
+            "name": name,
+            "share": 100 * status.done,
+            "stage": STAGE_WORDS.get(status.stage, status.stage),
+        }
+        if status.seconds_left is None or status.done == 0.0:
+            return say("Learning {name}: {share:.0f} %, {stage}", **fields)
+        left = duration_text(status.seconds_left)
+        return say("Learning {name}: {share:.0f} %, {left} left, {stage}", left=left, **fields)
     return {
         RunState.WAITING: f"{name} is queued",
         RunState.STOPPING: f"Learning {name}: stopping",

@@ -38,6 +38,7 @@ from lcollision_core.meshes.precision import (
     rounding_step,
 )
 from lcollision_core.meshes.topology import FloatArray, Topology, degenerate_faces
+from lcollision_core.sentences import say, say_number
 
 SINGLE_PRECISION = tuple(suffix for suffix, kind in FILES.items() if kind.is_single)
 """Formats that hold only float32; the others hold either precision."""
@@ -319,48 +320,70 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> tuple[str, ...
     first = first_at_each_position(points)
     duplicates = np.flatnonzero(first != np.arange(len(first)))
     open_edges, crowded_edges = topology.boundary_edges, topology.non_manifold_edges
-    defects: tuple[tuple[npt.NDArray[np.integer], str, str, str], ...] = (
-        (open_edges, "edge has", "edges have", "the mesh is open: {} one face"),
+    pinched, unused = topology.pinched_vertices, topology.unused_vertices
+    flat = degenerate_faces(topology, points)
+    start, end = crowded_edges[0] if len(crowded_edges) else (0, 0)
+    defects = (
+        (
+            open_edges,
+            say_number(
+                len(open_edges),
+                "the mesh is open: {n} edge has one face",
+                "the mesh is open: {n} edges have one face",
+            ),
+        ),
         (
             crowded_edges,
-            "edge has",
-            "edges have",
-            "the mesh is not manifold: {} more than two faces, the first between vertices {}",
+            say_number(
+                len(crowded_edges),
+                "the mesh is not manifold: {n} edge has more than two faces, the first between "
+                "vertices {start} and {end}",
+                "the mesh is not manifold: {n} edges have more than two faces, the first between "
+                "vertices {start} and {end}",
+                start=start,
+                end=end,
+            ),
         ),
         (
-            topology.pinched_vertices,
-            "vertex joins",
-            "vertices join",
-            "the mesh is not manifold: {} parts of the surface that share no edge there, the first "
-            "is vertex {}",
+            pinched,
+            say_number(
+                len(pinched),
+                "the mesh is not manifold: {n} vertex joins parts of the surface that share no "
+                "edge there, the first is vertex {first}",
+                "the mesh is not manifold: {n} vertices join parts of the surface that share no "
+                "edge there, the first is vertex {first}",
+                first=next(iter(pinched), 0),
+            ),
         ),
         (
-            topology.unused_vertices,
-            "vertex is",
-            "vertices are",
-            "{} in no face, the first is vertex {}",
+            unused,
+            say_number(
+                len(unused),
+                "{n} vertex is in no face, the first is vertex {first}",
+                "{n} vertices are in no face, the first is vertex {first}",
+                first=next(iter(unused), 0),
+            ),
         ),
         (
-            degenerate_faces(topology, points),
-            "face has",
-            "faces have",
-            "{} no area, the first is face {}",
+            flat,
+            say_number(
+                len(flat),
+                "{n} face has no area, the first is face {first}",
+                "{n} faces have no area, the first is face {first}",
+                first=next(iter(flat), 0),
+            ),
         ),
         (
             duplicates,
-            "vertex lies",
-            "vertices lie",
-            "{} exactly on an earlier vertex, the first is vertex {}",
+            say_number(
+                len(duplicates),
+                "{n} vertex lies exactly on an earlier vertex, the first is vertex {first}",
+                "{n} vertices lie exactly on an earlier vertex, the first is vertex {first}",
+                first=next(iter(duplicates), 0),
+            ),
         ),
     )
-    problems = [
-        sentence.format(
-            f"{len(defect)} {one if len(defect) == 1 else several}",
-            " and ".join(map(str, np.atleast_1d(defect[0]))),
-        )
-        for defect, one, several, sentence in defects
-        if len(defect)
-    ]
+    problems = [sentence for defect, sentence in defects if len(defect)]
     if not (topology.is_watertight or len(open_edges) or len(crowded_edges)):
-        problems.append("the mesh has neighbouring faces that are wound in opposite senses")
+        problems.append(say("the mesh has neighbouring faces that are wound in opposite senses"))
     return tuple(problems)

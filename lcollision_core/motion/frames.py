@@ -26,7 +26,7 @@ from lcollision_core.resolve import PoseResolver, ResolveOptions
 from lcollision_core.resolve.problem import ResolveProblem
 from lcollision_core.resolve.solvers import polish
 from lcollision_core.resolve.steps import LeastOverlap, bisect, slide_back
-from lcollision_core.sentences import marked, say, say_number
+from lcollision_core.sentences import both, marked, say, say_number
 
 HalfSpacesOfPose = tuple[FloatArray, FloatArray]
 """(C, D) normals and (C,) offsets that separate the contacts of one pose."""
@@ -798,7 +798,7 @@ class KeptSpan:
         return say(
             "{frames}: {parts}, {depth:.3g} % deep; {reason}",
             frames=what,
-            parts=" and ".join(dict.fromkeys(part_names[part] for part in self.parts[0])),
+            parts=both(*(part_names[part] for part in self.parts[0])),
             depth=100.0 * self.deepest,
             reason=say(self.reason),
         )

@@ -144,7 +144,9 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
     if not must_be_folder and has_known_suffix(path):
         raise LCollisionError.unwritable(
             path,
-            f"{suffix} is not a format of {'motions' if of_motions else 'poses'}",
+            f"{suffix} is not a format of motions"
+            if of_motions
+            else f"{suffix} is not a format of poses",
             f"use one of {', '.join(forms)} or a folder",
         )
     require_writable(path)

@@ -329,9 +329,9 @@ def read_scene_poses(
         else:
             names = ", ".join(member.name for member in body.members if member.moves)
             raise LCollisionError(
-                f"is a pose of no body of the scene: {failure.headline if failure else ''}".rstrip(
-                    ": "
-                ),
+                "is a pose of no body of the scene"
+                if failure is None
+                else f"is a pose of no body of the scene: {failure.headline}",
                 f"its bodies are {names}, and each takes one file",
                 where=path,
             )

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lcollision_core.errors import listed
+from lcollision_core.sentences import both
 from lcollision_core.sentences import counted as counted
 from lcollision_core.sentences import joined as joined
 from lcollision_core.sentences import say as say
@@ -236,7 +237,8 @@ def spent_text(seconds: float) -> str:
 
 def frames_text(frames: Sequence[object]) -> str:
     """List frames, by number or in pairs, at most ten."""
-    return ", ".join(map(str, frames[:10])) + (" ..." if len(frames) > 10 else "")
+    first = ", ".join(map(str, frames[:10]))
+    return say("{frames} ...", frames=first) if len(frames) > 10 else first
 
 
 def between_text(frames: Sequence[int]) -> str:
@@ -349,7 +351,7 @@ def checked_clip_text(verdict: CheckedClip) -> str:
                 frames=n_frames,
                 frame=worst.frame,
                 depth=height_text(worst.deepest, 2),
-                parts=" and ".join(dict.fromkeys(worst.parts[0])),
+                parts=both(*worst.parts[0]),
             )
         )
     parts.append(in_between_text(len(verdict.in_between)))
@@ -396,52 +398,65 @@ def resolved_pose_text(
     """
     from lcollision_core.resolve import Step
 
-    moved = say(
-        "moved by {mean:.2f} % of the body size, at most {most:.1f} %",
-        mean=100.0 * result.vertex_distance_mean,
-        most=100.0 * result.vertex_distance_max,
-    )
+    moved = {
+        "mean": 100.0 * result.vertex_distance_mean,
+        "most": 100.0 * result.vertex_distance_max,
+    }
     before, after = (
         counted(pairs or 0, "pair of faces", "pairs of faces")
         for pairs in (result.pairs_before, result.pairs_after)
     )
-    if result.exactly_free is None:
-        predicted = say("predicted free") if result.predicted_free else None
-        parts = [predicted or say("still predicted to collide"), say("not checked"), moved]
+    if result.exactly_free is None and result.predicted_free:
+        text = say(
+            "predicted free, not checked, moved by {mean:.2f} % of the body size, at most "
+            "{most:.1f} %",
+            **moved,
+        )
+    elif result.exactly_free is None:
+        text = say(
+            "still predicted to collide, not checked, moved by {mean:.2f} % of the body size, at "
+            "most {most:.1f} %",
+            **moved,
+        )
     elif result.exactly_free and result.step == Step.UNCHANGED:
-        parts = [say("already free")]
+        text = say("already free")
     elif result.exactly_free:
-        resolved = say("resolved {pairs} by the step {step}", pairs=before, step=result.step)
-        parts = [resolved, say("checked"), moved]
+        text = say(
+            "resolved {pairs} by the step {step}, checked, moved by {mean:.2f} % of the body size, "
+            "at most {most:.1f} %",
+            pairs=before,
+            step=result.step,
+            **moved,
+        )
     elif result.step == Step.SOFT:
-        parts = [
-            say("still colliding"),
-            say("{pairs} of {before}", pairs=after, before=result.pairs_before),
-            say("up to {depth} deep", depth=share_text(result.deepest_after or 0.0)),
-            say(
-                "overlap {share:.0f} % of before",
-                share=100.0 * (result.energy_after or 0.0) / (result.energy_before or 1.0),
-            ),
-            moved,
-        ]
+        text = say(
+            "still colliding, {pairs} of {before}, up to {depth} deep, overlap {share:.0f} % of "
+            "before, moved by {mean:.2f} % of the body size, at most {most:.1f} %",
+            pairs=after,
+            before=result.pairs_before,
+            depth=share_text(result.deepest_after or 0.0),
+            share=100.0 * (result.energy_after or 0.0) / (result.energy_before or 1.0),
+            **moved,
+        )
     else:
-        parts = [say("still colliding"), after]
+        text = say("still colliding, {pairs}", pairs=after)
     if colliding_parts:
-        parts.append(say("most of {names}", names=listed(colliding_parts, 3)))
+        names = listed(colliding_parts, 3)
+        text = say("{verdict}, most of {names}", verdict=text, names=names)
     if has_detail:
-        parts.append(say("with its detail"))
+        text = say("{verdict}, with its detail", verdict=text)
     elif fit is not None:
-        parts.append(
-            say(
-                "written as the nearest model pose, {error:.2f} % of the body size off",
-                error=100.0 * fit,
-            )
+        text = say(
+            "{verdict}, written as the nearest model pose, {error:.2f} % of the body size off",
+            verdict=text,
+            error=100.0 * fit,
         )
     elif result.step == Step.UNCHANGED:
-        parts.append(say("unchanged"))
+        text = say("{verdict}, unchanged", verdict=text)
     if clearance > 0.0 and result.exactly_free is not None:
-        parts.append(least_distance_words(result.least_distance, clearance))
-    return say("{verdict} ({seconds:.2f} s)", verdict=", ".join(parts), seconds=result.seconds)
+        least = least_distance_words(result.least_distance, clearance)
+        text = say("{verdict}, {least}", verdict=text, least=least)
+    return say("{verdict} ({seconds:.2f} s)", verdict=text, seconds=result.seconds)
 
 
 def resolved_clip_text(verdict: ResolvedClip) -> str:
@@ -542,7 +557,7 @@ def contacts_text(contacts: dict[str, Any] | None) -> str | None:
     """Describe how many of the source body's contacts a motion keeps; None if it has none."""
     if contacts is None or not contacts["frames"]:
         return None
-    lost = [" and ".join(names) for names in contacts["lost"]]
+    lost = [both(*names) for names in contacts["lost"]]
     contact_text = say(
         "{kept} of {all} contacts kept; together in {together} of {frames} frames, counted per "
         "contact",

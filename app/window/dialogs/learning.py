@@ -36,6 +36,7 @@ from lcollision_core.tasks.words import (
     grouped,
     height_text,
     one_line,
+    say,
     spent_text,
     with_capital,
 )
@@ -240,14 +241,20 @@ class LearningDialog(Dialog):
             return f"Added to your models. Training took {spent_text(seconds)}."
         if state == RunState.WAITING:
             others = [run.name for run in self._runs.runs if run.state == RunState.RUNNING]
-            when = f"after “{one_line(others[0])}”" if others else "in a moment"
-            return f"It starts {when}, while the editor is open."
-        words = [f"{100 * status.done:.0f} %"]
-        if state == RunState.RUNNING and status.seconds_left is not None and status.done > 0.0:
-            words.append(f"{duration_text(status.seconds_left)} left")
+            if others:
+                return say(
+                    "It starts after “{other}”, while the editor is open.",
+                    other=one_line(others[0]),
+                )
+            return say("It starts in a moment, while the editor is open.")
+        share = 100 * status.done
         if state == RunState.STOPPED:
-            words = [f"{words[0]} is done: Continue resumes from there."]
-        return ", ".join((*words, *(status.facts if run.is_active else ())))
+            return say("{share:.0f} % is done: Continue resumes from there.", share=share)
+        text = say("{share:.0f} %", share=share)
+        if state == RunState.RUNNING and status.seconds_left is not None and status.done > 0.0:
+            left = duration_text(status.seconds_left)
+            text = say("{share:.0f} %, {left} left", share=share, left=left)
+        return ", ".join((text, *(status.facts if run.is_active else ())))
 
     def _fit(self) -> None:
         """Grow to fit the content, and stay on the screen."""

@@ -286,7 +286,9 @@ def _plain(
         raise MeshFileError(
             "cannot be used",
             where=f"its array {name!r}",
-            expected=f"{'numbers' if 'f' in kinds else 'whole numbers'} of shape ({shape_text})",
+            expected=f"numbers of shape ({shape_text})"
+            if "f" in kinds
+            else f"whole numbers of shape ({shape_text})",
             got=f"{array.dtype} {array.shape}",
         )
     return array

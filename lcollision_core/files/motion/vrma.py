@@ -43,8 +43,10 @@ def read_vrma(path: str | os.PathLike[str], fps: float | None = None) -> Skeleto
 def _motion(document: GltfDocument, fps: float | None) -> SkeletonMotion:
     scene, bones = read_nodes(document), human_bones(document)
     order = [node for node in parents_first(scene.parents) if node in bones]
-    if not order or not scene.clips:
-        raise MeshFileError("it has no " + ("animation" if order else "humanoid bones"))
+    if not order:
+        raise MeshFileError("it has no humanoid bones")
+    if not scene.clips:
+        raise MeshFileError("it has no animation")
     names = [bones[node] for node in order]
     motion = motion_of_nodes(scene, scene.clips[0], order, names, fps)
     return replace(motion, notes=tuple(_left_out(document, len(scene.clips))))
