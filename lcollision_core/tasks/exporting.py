@@ -629,11 +629,11 @@ def write_motions(
             collides[start:stop] = [posed[n].collides(body) for n in range(start, stop)]
 
         for_blocks(look, len(posed), 1, job=job.part())
-        _count_stuck(row, body, collides)
+        count_stuck(row, body, collides)
     elif output.form == "poses" and body.joints is not None:
         for motion, row in zip(motions, rows, strict=True):
             if motion.space_at is not None:
-                _count_stuck(row, body, ~check.are_free(motion.codes))
+                count_stuck(row, body, ~check.are_free(motion.codes))
                 left_out = say(
                     "{path}: pose files store rotations and weights only; other deformation in "
                     "{clip} is left out (use .glb or .pc2 to keep it)",
@@ -643,7 +643,7 @@ def write_motions(
                 job.note(left_out)
 
 
-def _count_stuck(
+def count_stuck(
     row: ResolvedClip,
     body: Body,
     collides: npt.NDArray[np.bool_],
@@ -707,7 +707,7 @@ def _write_clips(
         # Rounding reduces the clearance slightly; without one, the check of the file decides.
         if row.clearance == 0.0:
             row.colliding_frames = []
-        _count_stuck(row, body, ~of_file, put_back)
+        count_stuck(row, body, ~of_file, put_back)
 
 
 # The bodies of scenes.

@@ -21,7 +21,6 @@ from lcollision_core.bodies import (
 )
 from lcollision_core.bodies.motions import (
     MotionChange,
-    is_retargeted,
     read_motions,
     write_clips,
     write_new_clips,
@@ -50,6 +49,7 @@ from lcollision_core.model_file import digest_of
 from lcollision_core.motion.motion import Motion, runs
 from lcollision_core.options import ExportRequest, MotionChoice, SceneOptions
 from lcollision_core.tasks.exporting import (
+    count_stuck,
     refuse_to_replace,
     source_files,
     write_members,
@@ -380,6 +380,12 @@ class PlayedMotion:
     file: Path | None
     start: int
 
+    @property
+    def is_own_clip(self) -> bool:
+        """Whether it is a clip of a character's own file, which is written with it changed."""
+        body, file = self.member.body, self.file
+        return file is not None and bends(body) and body.is_of_file(file)
+
     def frames(self, n: int) -> npt.NDArray[np.intp]:
         """Return the motion's frame in each of n frames of the scene, clamped to its ends."""
         last = 0 if self.motion is None else len(self.motion) - 1
@@ -533,22 +539,50 @@ def write_member_motions(
         else:
             assert played_motion is not None
             new = body.codes_of_member(member.name, after.codes)
-            old = body.codes_of_member(member.name, before.codes)
-            motion, source = played_motion.motion, played_motion.file
-            is_own = source is not None and not is_retargeted(member.body, source)
-            if motion is None or not is_own:
+            motion, first = played_motion.motion, played_motion.start
+            if motion is None or not played_motion.is_own_clip:
                 name = before.name if motion is None else motion.name
                 write_new_clips(path, member.body, [Motion(name, after.times, new)])
             else:
-                first = played_motion.start
-                frame_rows = slice(first, first + len(motion))
-                changed = replace(motion, codes=np.array(new[frame_rows]))
-                spans = runs((old[frame_rows] != new[frame_rows]).any(axis=1))
+                motion = _lasting(motion, n - first)
+                changed = replace(motion, codes=np.array(new[first:]))
+                spans = runs((motion.codes != changed.codes).any(axis=1))
                 change = MotionChange(motion, changed, spans)
                 written = write_clips(path, member.body, own_file, [change])
                 for sentence in written.notes:
                     job.note(f"{member.name}: {sentence}")
         job.note(say("wrote {name} to {path}", name=member.name, path=path))
+
+
+def _lasting(motion: Motion, n: int) -> Motion:
+    """Return a motion that stays in its last frame until it has n frames."""
+    last, space_at, hidden = len(motion) - 1, motion.space_at, motion.hidden
+    if n == last + 1:
+        return motion
+    frames = np.minimum(np.arange(n), last)
+    after = motion.times[-1] + np.arange(1, n - last) / motion.rate
+    return replace(
+        motion,
+        times=np.concatenate([motion.times, after]),
+        codes=motion.codes[frames],
+        space_at=None if space_at is None else lambda time: space_at(min(time, last)),
+        hidden=None if hidden is None else lambda frame: hidden(min(frame, last)),
+        contacts=None,
+    )
+
+
+def _as_played(body: SceneBody, after: Motion, played: Sequence[PlayedMotion], job: Job) -> Motion:
+    """Return a motion as its clips play it: until its start, a body stays in its first frame."""
+    start_of = {of_body.member.name: of_body.start for of_body in played if of_body.is_own_clip}
+    codes = after.codes.copy()
+    for member, places in zip(body.standing, body.space.codes, strict=True):
+        start = start_of.get(member.name, 0)
+        first = codes[start, places]
+        if (codes[:start, places] != first).any():
+            note = "{name}: until its clip starts, it stays in the first frame of the clip"
+            job.note(say(note, name=member.name))
+            codes[:start, places] = first
+    return after if np.array_equal(codes, after.codes) else replace(after, codes=codes)
 
 
 def playing(scene: SceneFile, number: int, clip: str, start: float) -> SceneFile:
@@ -598,6 +632,7 @@ def export_scene_motion(
     before : the motion as read from the bodies' clips
     """
     played = scene_motion(body, (), MotionChoice(), job)[1]
+    after = _as_played(body, after, played, job)
     write_member_motions(folder, body, before, after, played, job)
     return say("Exported each body to {folder}", folder=folder.name)
 
@@ -634,7 +669,10 @@ def resolve_scene_motion(
     with run_of_motions(request, [motion], job) as run:
         change, row = resolve_one(request, motion, run, 0, job)
         if output.form == "folder":
-            write_member_motions(output.path, body, motion, change.after, of_bodies, job)
+            after = _as_played(body, change.after, of_bodies, job)
+            if after is not change.after:
+                count_stuck(row, body, ~after.are_free(body.exact_check()))
+            write_member_motions(output.path, body, motion, after, of_bodies, job)
         else:
             write_motions(output, body, Path(), [change], [row], job)
     return row

@@ -87,10 +87,45 @@ def test_clips_play_together_from_when_they_are_said_to(
     (after,) = json.loads(resolved.stdout)
     assert after["frames"] == row["frames"]
     assert after["free_after"] >= after["free_before"]
-    for name in ("hero.glb", "hero 2.glb"):
+    # The first one gives way to the second one after the end of its own clip.
+    for name, n_frames in (("hero.glb", row["frames"]), ("hero 2.glb", 8)):
         (motion,) = read_motions(open_body(out / name), out / name)
-        assert len(motion) == 8
+        assert len(motion) == n_frames
         assert np.isfinite(motion.codes).all()
+
+
+def test_a_written_scene_plays_as_it_was_reported_when_one_clip_ends_first(
+    lcollision: Lcollision, hero: Path, tmp_path: Path
+) -> None:
+    short = write_gltf(rigged_body(n_frames=3), tmp_path / "short.glb")
+    out, place = tmp_path / "out", ("--at", "short=0.9,0.02,0,180")
+    resolved = lcollision(
+        *("resolve", "--motion", "--json", hero, "--with", short, *place, "-o", f"{out}/")
+    )
+    (row,) = json.loads(resolved.stdout)
+    again = ("--clips", "--json", out / "hero.glb", "--with", out / "short.glb", *place)
+    (played,) = json.loads(lcollision("check", *again).stdout)
+    assert played["frames"] == row["frames"] == 8
+    assert row["free_after"] > row["free_before"]
+    colliding = [frame["frame"] for frame in played["colliding_frames"]]
+    assert colliding == row["colliding_frames"]
+    (longer,) = read_motions(open_body(out / "short.glb"), out / "short.glb")
+    assert len(longer) > 3
+
+
+def test_what_moves_before_a_clip_starts_is_reported_as_it_is_played(
+    lcollision: Lcollision, hero: Path, tmp_path: Path
+) -> None:
+    clip, out = open_body(hero).own_clips[0], tmp_path / "out"
+    place = ("--at", "hero 2=0.9,0.02,0,180", "--play", f"hero 2={clip}@0.15")
+    resolved = lcollision(
+        *("resolve", "--motion", "--json", hero, "--with", hero, *place, "-o", f"{out}/")
+    )
+    (row,) = json.loads(resolved.stdout)
+    again = ("--clips", "--json", out / "hero.glb", "--with", out / "hero 2.glb", *place)
+    (played,) = json.loads(lcollision("check", *again).stdout)
+    assert [frame["frame"] for frame in played["colliding_frames"]] == row["colliding_frames"]
+    assert "hero 2: until its clip starts, it stays in the first frame" in resolved.stderr
 
 
 @pytest.mark.parametrize(
