@@ -579,8 +579,9 @@ def _as_played(body: SceneBody, after: Motion, played: Sequence[PlayedMotion], j
         start = start_of.get(member.name, 0)
         first = codes[start, places]
         if (codes[:start, places] != first).any():
-            note = "{name}: until its clip starts, it stays in the first frame of the clip"
-            job.note(say(note, name=member.name))
+            job.note(
+                say("{name}: until its clip starts, it stays in the first frame", name=member.name)
+            )
             codes[:start, places] = first
     return after if np.array_equal(codes, after.codes) else replace(after, codes=codes)
 
