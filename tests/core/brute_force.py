@@ -153,11 +153,11 @@ def depths(a: FloatArray, b: FloatArray) -> FloatArray:
     depth = np.full(len(a), np.inf)
     active = np.arange(len(a))
     # The pairs are the last axis, so that all sums and extremes are over leading ones.
-    points = (a[:, :, None] - b[:, None, :]).reshape(-1, 9, 3).transpose(1, 2, 0)
+    points = (a[:, :, None] - b[:, None, :]).reshape(-1, 9, 3)
+    here = np.ascontiguousarray(points.transpose(1, 2, 0))
     # Planes along an edge of each separate most pairs that do not meet, and come first, one by one.
     rest = [triple for triple in TRIPLES if triple not in _ACROSS_EDGES]
     for triples in map(np.array, [*([triple] for triple in _ACROSS_EDGES), rest]):
-        here = np.take(points, active, axis=2)
         i, j, k = (here[corners] for corners in triples.T)
         u, v = j - i, k - i
         n = np.cross(u, v, axis=1)
@@ -168,7 +168,8 @@ def depths(a: FloatArray, b: FloatArray) -> FloatArray:
         support = np.minimum(along.max(axis=0), -along.min(axis=0))
         least = np.where(spans, np.maximum(support, 0.0), np.inf).min(axis=0)
         depth[active] = np.minimum(depth[active], least)
-        active = active[depth[active] > 0.0]
+        meet = depth[active] > 0.0
+        active, here = active[meet], np.compress(meet, here, axis=2)
     return np.where(np.isinf(depth), 0.0, depth)
 
 
