@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partialmethod
 from pathlib import Path
 
 import pytest
@@ -202,6 +203,8 @@ def test_a_process_that_comes_second_leaves_what_the_first_is_asked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stay_as_it_is(monkeypatch)
+    # It waits five seconds for the first to end.
+    monkeypatch.setattr(WorkFolder, "lock", partialmethod(WorkFolder.lock, wait=0.2))
     work = folder_of("hero", RunState.RUNNING)
     for name in (WANTED, STOP):
         (work.path / name).touch()
