@@ -41,7 +41,11 @@ def pytest_collection() -> Iterator[None]:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests as slow: of unpublished data, and all but the first of `variants`."""
+    """Mark tests as slow: of unpublished data, and all but the first of `variants`.
+
+    Those marked `long` come first.
+    """
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)
     counts: Counter[str] = Counter()
     for item in items:
         variants = item.get_closest_marker("variants")

@@ -45,6 +45,7 @@ def test_colliding_poses_of_the_bundled_body_end_free(
     assert not [path.name for path in resolved if crossing_pairs(*read_obj(path))]
 
 
+@pytest.mark.long
 def test_scape_from_meshes_to_an_exported_pose(
     scape: PoseSet,
     lcollision: Lcollision,

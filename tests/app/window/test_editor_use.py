@@ -565,6 +565,7 @@ def test_random_actions_tell_what_goes_wrong_and_go_on(
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("home")
 def test_the_benchmark_measures_a_session_of_its_own(
     lcollision: Lcollision,

@@ -352,6 +352,7 @@ def character_window(
     return open_window(qtbot, document, settings, (1280, 860))
 
 
+@pytest.mark.long
 @CHARACTERS
 def test_a_character_is_posed_by_mouse_in_four_drags_each(
     qtbot: QtBot, character_window: MainWindow
