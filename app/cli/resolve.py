@@ -351,6 +351,11 @@ def _resolve_motions(
     scene = as_scene(request.body)
     if scene is None:
         request = request.with_files_of_folder(Job(note=note))
+    elif request.files:
+        file, name = request.files[0], scene.members[0].name
+        raise LCollisionError(
+            "is no body of the scene", f"say who moves by it: --play '{name}={file}'", where=file
+        )
     each = scene is None and request.has_output_each
     if request.only_check and not each:
         raise LCollisionError(

@@ -11,7 +11,7 @@ import pytest
 from lcollision_core.bodies import open_body
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.tasks.opening import open_any
-from tests.app.support import Lcollision
+from tests.app.support import Lcollision, refusal
 from tests.rigged_shapes import rigged_body, write_gltf
 from tests.skeletons import PERSON, character_from
 
@@ -111,6 +111,20 @@ def test_a_written_scene_plays_as_it_was_reported_when_one_clip_ends_first(
     assert colliding == row["colliding_frames"]
     (longer,) = read_motions(open_body(out / "short.glb"), out / "short.glb")
     assert len(longer) > 3
+
+
+def test_a_motion_without_its_body_is_refused_in_a_scene(
+    lcollision: Lcollision, hero: Path, tmp_path: Path
+) -> None:
+    walk, out = tmp_path / "walk.bvh", tmp_path / "out"
+    assert lcollision("resolve", "--motion", hero, "-o", walk).exit_code == 0
+    scene = ("--with", hero, "--at", "hero 2=3,0,0")
+    refused = refusal(lcollision, "resolve", hero, walk, *scene, "-o", f"{out}/")
+    assert refused.endswith(
+        f"walk.bvh is no body of the scene; say who moves by it: --play 'hero={walk}'"
+    )
+    play = ("--play", f"hero={walk}")
+    assert lcollision("resolve", "--motion", hero, *scene, *play, "-o", f"{out}/").exit_code == 0
 
 
 def test_what_moves_before_a_clip_starts_is_reported_as_it_is_played(
