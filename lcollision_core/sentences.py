@@ -1,4 +1,4 @@
-"""The one way of whole sentences to people: a translation sets its catalogue as `CATALOGUE`.
+"""Whole sentences of verdicts and reports: a translation sets its catalogue as `CATALOGUE`.
 
 `xgettext -k say -k say_number:2,3 -k counted:2,3 -k marked` collects them: each is a literal with
 named fields.

@@ -28,7 +28,8 @@ class Docking:
     text, shortcut, tip : of the action that shows or hides it
     area : default area
     width : default width of a side panel: a fraction of the window's width, and its minimum and
-        maximum in device-independent pixels
+        maximum in device-independent pixels; a width that the user sets is stored as "<key>_width"
+        of `SETTINGS`
     """
 
     key: str

@@ -1,4 +1,4 @@
-"""The pose space of a rig: joint angles as codes, their limits, and the skin."""
+"""The pose space of a rig: joint angles and morph weights as codes, their limits, the skin."""
 
 from __future__ import annotations
 

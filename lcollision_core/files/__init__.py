@@ -1,4 +1,4 @@
-"""Read and write files: meshes, scenes, characters, motions and pose sets."""
+"""Read and write files: meshes, scenes, characters, motions and pose sets, by `formats.FILES`."""
 
 from typing import TYPE_CHECKING
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -20,6 +21,13 @@ Schedule = Literal["constant", "one-cycle"]
 
 LEAST_PASSES = 6
 """Least number of passes if `shown_rows` shortens a training."""
+
+
+class Architecture(Enum):
+    """The kinds of networks. mypy names the places that a further one needs."""
+
+    GEOMETRIC = auto()
+    PAPER = auto()
 
 
 @dataclass(frozen=True)
@@ -76,6 +84,11 @@ class PredictorConfig:
         return min(self.epochs, max(LEAST_PASSES, -(-self.shown_rows // n_rows)))
 
     @property
+    def architecture(self) -> Architecture:
+        """The kind of the preset's network."""
+        return Architecture.PAPER if self.preset == "paper" else Architecture.GEOMETRIC
+
+    @property
     def described(self) -> str:
         """The preset, and what was left out of it."""
         usual = PRESETS[self.preset]
@@ -94,7 +107,7 @@ class PredictorConfig:
         ------
         LCollisionError : the preset's loss lacks these terms.
         """
-        if loss != "full" and self.preset != "paper":
+        if loss != "full" and self.architecture is not Architecture.PAPER:
             raise LCollisionError(
                 f"only the preset paper can be trained with the loss {loss}", "add --preset paper"
             )

@@ -20,7 +20,7 @@ from lcollision_core.labels.labeller import LabelRows, StoreIdentity
 from lcollision_core.meshes.topology import FloatArray, latent_array
 from lcollision_core.model_file import Section
 from lcollision_core.predictor.compiled_network import CompiledNetwork
-from lcollision_core.predictor.config import PRESETS, PredictorConfig
+from lcollision_core.predictor.config import PRESETS, Architecture, PredictorConfig
 from lcollision_core.predictor.metrics import KindScores, PredictorMetrics
 from lcollision_core.predictor.stored_network import require_network
 
@@ -132,7 +132,7 @@ class PredictorRecord:
             if record.config.preset != preset:
                 got = quoted(record.config.preset)
                 raise ValueError(f"config.preset must be {preset!r}, got {got}")
-            require_network(section.arrays, embedding, preset, record.config.by_domain)
+            require_network(section.arrays, embedding, record.config)
         except (ValueError, LCollisionError) as error:
             what, next_step = "does not fit its latent space", "train the predictor again"
             raise ModelFileError.because("the model's predictor", what, error, next_step) from error
@@ -339,17 +339,21 @@ class CollisionPredictor:
 
     @cached_property
     def _compiled(self) -> CompiledNetwork | None:
-        """The network for the CPU, without torch; None for the preset `paper` and on a GPU."""
-        if self.config.preset == "paper" or self.device != "cpu":
+        """The network for the CPU, without torch; None for the paper's network and on a GPU."""
+        if self.device != "cpu":
             return None
-        return CompiledNetwork(self.embedding, self.arrays)
+        match self.config.architecture:
+            case Architecture.GEOMETRIC:
+                return CompiledNetwork(self.embedding, self.arrays)
+            case Architecture.PAPER:
+                return None
 
     def network(self) -> PredictorNetwork:
         """Return a new torch network in single precision on the CPU, with fixed weights."""
         import torch
 
         state = {name: torch.tensor(array) for name, array in self.arrays.items()}
-        network = network_of(self.config.preset).restore(self.embedding, self.config, state)
+        network = network_of(self.config.architecture).restore(self.embedding, self.config, state)
         return network.requires_grad_(False).eval()
 
     @cached_property
@@ -385,18 +389,21 @@ def runs_as_graph(config: PredictorConfig, device: str) -> bool:
 
     Otherwise torch computes everything on a GPU, operation by operation.
     """
-    return device == "cuda" and config.preset != "paper" and has_gpu_kernels()
+    is_geometric = config.architecture is Architecture.GEOMETRIC
+    return device == "cuda" and is_geometric and has_gpu_kernels()
 
 
-def network_of(preset: str) -> type[PredictorNetwork]:
-    """Return the class of a preset's network, which needs torch."""
-    if preset == "paper":
-        from lcollision_core.predictor.paper_network import PaperNetwork
+def network_of(architecture: Architecture) -> type[PredictorNetwork]:
+    """Return the class of a network, which needs torch."""
+    match architecture:
+        case Architecture.GEOMETRIC:
+            from lcollision_core.predictor.geometric_network import GeometricNetwork
 
-        return PaperNetwork
-    from lcollision_core.predictor.geometric_network import GeometricNetwork
+            return GeometricNetwork
+        case Architecture.PAPER:
+            from lcollision_core.predictor.paper_network import PaperNetwork
 
-    return GeometricNetwork
+            return PaperNetwork
 
 
 def require_model(rows: LabelRows, embedding: Embedding) -> None:

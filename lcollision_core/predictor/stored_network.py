@@ -7,7 +7,7 @@ until the first prediction. The arrays are checked before that.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, assert_never
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ import numpy.typing as npt
 from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.model_file import required_array
+from lcollision_core.predictor.config import Architecture, PredictorConfig
 from lcollision_core.predictor.kernels import UNITS
 
 ENCODER_SIZES = (512, 256, 256)
@@ -28,15 +29,14 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 _LARGEST_WEIGHT, _LEAST_DEVIATION = 1e4, 1e-6
 
 
-def require_network(arrays: Arrays, embedding: Embedding, preset: str, by_domain: bool) -> None:
-    """Check that arrays are the state dict of a preset's network for an embedding.
+def require_network(arrays: Arrays, embedding: Embedding, config: PredictorConfig) -> None:
+    """Check that arrays are the state dict of a network for an embedding.
 
     Parameters
     ----------
     arrays : of the model file's section
     embedding : of the latent codes
-    preset : of `PRESETS`
-    by_domain : whether the network has a predictor for each domain
+    config : of the network
 
     Raises
     ------
@@ -44,12 +44,15 @@ def require_network(arrays: Arrays, embedding: Embedding, preset: str, by_domain
         beyond trained ones.
     """
     reader = _Reader(arrays)
-    if preset == "paper":
-        _require_paper(reader, embedding, by_domain)
-    elif by_domain:
-        _require_default(reader, embedding)
-    else:
-        raise ValueError("only the preset paper has a network without domains")
+    match config.architecture:
+        case Architecture.PAPER:
+            _require_paper(reader, embedding, config.by_domain)
+        case Architecture.GEOMETRIC:
+            if not config.by_domain:
+                raise ValueError("only the preset paper has a network without domains")
+            _require_geometric(reader, embedding)
+        case unknown:
+            assert_never(unknown)
     others = arrays.keys() - reader.names
     if others:
         raise ValueError(f"it has an unknown array {min(others)[:60]}")
@@ -91,7 +94,7 @@ class _Reader:
             self.array(f"{name}.bias", *of_bias, width)
 
 
-def _require_default(reader: _Reader, embedding: Embedding) -> None:
+def _require_geometric(reader: _Reader, embedding: Embedding) -> None:
     topology = embedding.topology
     n_points = reader.array("body.points", None, None).shape[1]
     reader.array("body.points", 3 * n_points, n_points)

@@ -312,7 +312,7 @@ class TrainingLoop:
         key = self._key()
         checkpoint = Checkpoint(self.checkpoint, key)
         some = self.rows.taken(self._training_index[:_BUILDING_ROWS])
-        network = network_of(config.preset).build(
+        network = network_of(config.architecture).build(
             self.embedding, config, some, self.facts.seed, self._rules, self.groups
         )
         network = network.to(processes.device)

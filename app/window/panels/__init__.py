@@ -1,1 +1,1 @@
-"""Panels round the viewport: bodies, sliders, collisions, poses and timeline."""
+"""Panels round the viewport, made by `MainWindow`: bodies, sliders, collisions, poses, timeline."""

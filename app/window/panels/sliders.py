@@ -1,4 +1,4 @@
-"""The panel of sliders: one for each code, grouped, and the row that randomises them."""
+"""The panel of sliders, one for each code of `Body.latent_space`, and the row that randomises."""
 
 from __future__ import annotations
 

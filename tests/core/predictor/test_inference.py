@@ -11,6 +11,7 @@ import torch
 
 from lcollision_core.bodies import LearnedBody
 from lcollision_core.predictor.compiled_network import CompiledNetwork
+from lcollision_core.predictor.config import PRESETS
 from lcollision_core.predictor.geometric_network import GeometricNetwork
 from lcollision_core.predictor.stored_network import require_network
 
@@ -78,7 +79,7 @@ def test_arrays_of_another_network_are_refused(
     tube_model: LearnedBody, network: GeometricNetwork
 ) -> None:
     embedding, arrays = tube_model.embedding, _arrays(network)
-    require_network(arrays, embedding, "default", True)
+    require_network(arrays, embedding, PRESETS["default"])
     for name in arrays:
         wrong = {**arrays, name: np.concatenate([arrays[name], arrays[name]], axis=-1)}
         if name == "site_vertices":
@@ -86,10 +87,10 @@ def test_arrays_of_another_network_are_refused(
             if not arrays[name].size:
                 continue
         with pytest.raises(ValueError, match=rf"array {name}|shape|sites"):
-            require_network(wrong, embedding, "default", True)
+            require_network(wrong, embedding, PRESETS["default"])
         fewer = {key: array for key, array in arrays.items() if key != name}
         with pytest.raises(ValueError, match=name):
-            require_network(fewer, embedding, "default", True)
+            require_network(fewer, embedding, PRESETS["default"])
 
 
 def test_posing_predicting_and_resolving_need_neither_torch_nor_a_front_end() -> None:
