@@ -277,3 +277,19 @@ def digest_of(text: str, tensors: Mapping[str, npt.NDArray[Any]]) -> str:
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
         digest.update(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
     return digest.hexdigest()
+
+
+def run_key(arrays: Mapping[str, npt.NDArray[Any]], options: Mapping[str, Any]) -> str:
+    """Return a digest that identifies a run, such as of training.
+
+    Parameters
+    ----------
+    arrays : its data, by name
+    options : JSON values
+    """
+    digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()

@@ -25,7 +25,7 @@ from app.benchmarks.measures import Row, is_free_by_brute_force
 from lcollision_core.bodies import Body
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes.evenly_spaced import evenly_spaced
+from lcollision_core.meshes.topology import evenly_spaced
 from lcollision_core.motion import (
     NOMINAL_RATE,
     Motion,

@@ -15,7 +15,7 @@ from lcollision_core.contact import touching_patches
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import GROUP_KINDS, ContactRules
 from lcollision_core.meshes.contact_rules import MAX_TOUCHING, TOUCHING_RADIUS
-from lcollision_core.meshes.evenly_spaced import evenly_spaced
+from lcollision_core.meshes.topology import evenly_spaced
 
 _MOST_POSES, _FEWEST_POSES = 40, 8
 """Most poses of a body that are checked, evenly spaced; and how many of them suffice."""

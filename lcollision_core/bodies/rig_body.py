@@ -59,11 +59,10 @@ from lcollision_core.meshes.contact_rules import (
     MAX_GROUP_NAME_LENGTH,
     TOUCHING_RADIUS,
 )
-from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
 from lcollision_core.meshes.joint_kinds import Role, Side
-from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.topology import FloatArray, evenly_spaced
 from lcollision_core.model_file import digest_of
 
 if TYPE_CHECKING:

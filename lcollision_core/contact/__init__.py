@@ -6,13 +6,17 @@ coincide exactly have depth 0: they touch, and do not collide. `CollisionDetecto
 them. With a clearance, triangles nearer than it collide: see `CollisionDetector.with_clearance`.
 """
 
-from lcollision_core.contact.depth import depth_slopes, penetration_depth
 from lcollision_core.contact.detector import (
     BatchCollisions,
     CollisionDetector,
     SelfCollisions,
 )
-from lcollision_core.contact.distance import distance_slopes, triangle_distance
+from lcollision_core.contact.distance import (
+    depth_slopes,
+    distance_slopes,
+    penetration_depth,
+    triangle_distance,
+)
 from lcollision_core.contact.exclusions import DISTANCE_BOUND, NearestPair
 from lcollision_core.contact.propose import (
     GroupPair,

@@ -41,8 +41,7 @@ from lcollision_core.embedding.seeding import (
     vertex_areas,
 )
 from lcollision_core.embedding.training_run import EmbeddingConfig, Run
-from lcollision_core.meshes.evenly_spaced import evenly_spaced
-from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.topology import FloatArray, evenly_spaced
 
 
 class _RingMean(torch.autograd.Function):

@@ -29,7 +29,6 @@ from lcollision_core.embedding.training_run import (
     Checkpoint,
     EmbeddingConfig,
     Run,
-    run_key,
 )
 from lcollision_core.errors import PoseSetError
 from lcollision_core.files.pose_set import PoseSet
@@ -38,6 +37,7 @@ from lcollision_core.meshes.alignment import align_rigid
 from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.precision import can_hold
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.model_file import run_key
 
 _JACOBIAN_BYTES = 2_000_000_000
 """Bound on the memory of the Jacobians of poses that are fitted together."""

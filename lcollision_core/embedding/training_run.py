@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError
@@ -20,22 +17,6 @@ from lcollision_core.options import Limits, require_limits
 
 _SECONDS_BETWEEN_WRITES = 15.0
 _RUN = "run"
-
-
-def run_key(arrays: Mapping[str, npt.NDArray[Any]], options: Mapping[str, Any]) -> str:
-    """Return a digest that identifies a training run.
-
-    Parameters
-    ----------
-    arrays : the training data, by name
-    options : JSON values
-    """
-    digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
 
 
 class Checkpoint:

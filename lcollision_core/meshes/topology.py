@@ -44,6 +44,17 @@ def consecutive(sizes: Iterable[int]) -> list[slice]:
     return [slice(start, end) for start, end in pairwise(accumulate(sizes, initial=0))]
 
 
+def evenly_spaced(count: int, most: int) -> npt.NDArray[np.int64]:
+    """Return at most `most` of the indices below `count`, ascending, including first and last.
+
+    Parameters
+    ----------
+    count : > 0
+    most : > 0; 1 returns the first
+    """
+    return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
+
+
 def edge_graph(edges: IntArray, n_vertices: int, weights: FloatArray) -> scipy.sparse.csr_matrix:
     """Return the symmetric (V, V) matrix of (E,) weights of (E, 2) edges, in sorted CSR form."""
     i, j = edges.T

@@ -22,11 +22,12 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel
 
 from lcollision_core.embedding.bilevel import Embedding
-from lcollision_core.embedding.training_run import Checkpoint, run_key
+from lcollision_core.embedding.training_run import Checkpoint
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.labels import LabelRows
 from lcollision_core.meshes import STRICT, ContactRules, FaceGroup
+from lcollision_core.model_file import run_key
 from lcollision_core.predictor.config import (
     PredictorConfig,
     PredictorStatus,

@@ -20,8 +20,7 @@ from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes import RigidTransform
-from lcollision_core.meshes.evenly_spaced import evenly_spaced
-from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.topology import FloatArray, evenly_spaced
 from lcollision_core.options import Metric, ResolveOptions, Solver
 from lcollision_core.posing import ExactCheck, PoseSpace
 from lcollision_core.resolve.problem import (

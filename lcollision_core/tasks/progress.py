@@ -13,12 +13,12 @@ from typing import Any, Generic, TypeVar
 import numpy.typing as npt
 
 from lcollision_core.bodies import Body, NamedPose, read_poses, write_poses
-from lcollision_core.embedding.training_run import run_key
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.files import locked
 from lcollision_core.files.safe import shortened, write_bytes
 from lcollision_core.jobs import Job
 from lcollision_core.meshes.face_groups import ignored_faces_digest
+from lcollision_core.model_file import run_key
 from lcollision_core.options import ResolveOptions
 from lcollision_core.tasks.words import counted, say
 

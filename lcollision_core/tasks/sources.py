@@ -34,7 +34,7 @@ from lcollision_core.files.table import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import Topology, UpGuess, body_size, guess_up
 from lcollision_core.meshes.contact_rules import TOUCHING_RADIUS
-from lcollision_core.meshes.evenly_spaced import evenly_spaced
+from lcollision_core.meshes.topology import evenly_spaced
 from lcollision_core.options import NO_CHANGE, LearningRequest, RuleOptions
 
 ENOUGH_POSES = 100

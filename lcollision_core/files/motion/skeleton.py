@@ -13,8 +13,7 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.files.scene.joined import sample_clip
 from lcollision_core.files.scene.scene import Clip, Scene, nearest_above, parents_first
 from lcollision_core.files.scene.transforms import are_regular
-from lcollision_core.meshes.evenly_spaced import evenly_spaced
-from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.topology import FloatArray, evenly_spaced
 
 _SAME_AXIS = 0.5
 """Cosine that separates parallel axes from perpendicular ones."""
