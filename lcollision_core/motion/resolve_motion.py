@@ -412,7 +412,7 @@ class _Resolution:
         return [span for span in corrected.spans() if is_open[problem.own(span)].any()]
 
     def _bar_faults(self, span: range, faults: Mapping[int, Reason]) -> None:
-        """Bar the colliding frames of a span that are nearest to faults."""
+        """Bar the colliding frames of a span that are nearest to faults; a stop bars all."""
         own, places = self.problem.own(span), self.problem.places(span)
         corrected = self.corrected
         inside = runs((corrected.colliding & ~corrected.barred)[own])
@@ -425,8 +425,9 @@ class _Resolution:
                 continue
             # A pose before the span belongs to its first frame.
             place = places.get(at, 0)
-            nearest = min(inside, key=lambda run: max(run.start - place, place - run.stop + 1))
-            corrected.bar(own[nearest.start : nearest.stop], reason)
+            if inside:
+                nearest = min(inside, key=lambda run: max(run.start - place, place - run.stop + 1))
+                corrected.bar(own[nearest.start : nearest.stop], reason)
 
     def _jerk(self, span: range) -> dict[int, Reason]:
         """Return the colliding frame nearest to the worst jerk that correcting a span adds."""

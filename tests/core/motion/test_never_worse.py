@@ -22,6 +22,7 @@ from lcollision_core.bodies.motions import (
 )
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.contact import DEPTH_TOLERANCE
+from lcollision_core.errors import CancelledError
 from lcollision_core.files import Rig
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import Topology
@@ -33,7 +34,9 @@ from lcollision_core.motion import (
     resolve_motion,
     screen_motion,
 )
+from lcollision_core.motion.corrected_frames import CorrectedFrames
 from lcollision_core.motion.frames import Frames, Reason
+from lcollision_core.motion.spans import SpanSolver
 from lcollision_core.options import MotionChoice
 from lcollision_core.resolve import ResolveOptions
 from lcollision_core.tasks.exporting import Output, write_motions
@@ -306,6 +309,30 @@ def test_a_stop_while_overlap_is_reduced_keeps_what_was_freed(
     assert not found.after[:3].any()
     assert found.after[3:].all()
     assert [kept.frames for kept in found.kept] == [(0, 2)]
+
+
+def test_what_a_stop_leaves_worse_between_frames_stays_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    body, motion = in_the_trunk(range(2, 5))
+    motion, stop = motion.part(range(5, 14)), Job()
+    solve = SpanSolver.solve
+
+    def stopped(solver: SpanSolver) -> None:
+        solve(solver)
+        stop.cancel()
+        raise CancelledError("stopped")
+
+    def between(corrected: CorrectedFrames, span: range) -> dict[int, Reason]:
+        return {int(corrected.colliding[span.start :].argmax()) + span.start: Reason.BETWEEN}
+
+    monkeypatch.setattr(SpanSolver, "solve", stopped)
+    monkeypatch.setattr(SpanSolver, "keep_finished", lambda solver: solver.span)
+    monkeypatch.setattr(CorrectedFrames, "faults", between)
+    result = resolve_motion(body.resolver, motion, UP, stop=stop)
+    assert np.array_equal(result.motion.codes, motion.codes)
+    assert np.array_equal(result.after, result.before)
+    assert not result.after.all()
 
 
 def waving() -> tuple[RigBody, Motion]:
