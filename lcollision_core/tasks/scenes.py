@@ -42,7 +42,7 @@ from lcollision_core.bodies.scene_file import (
     write_scene_file,
 )
 from lcollision_core.bundled import user_folder
-from lcollision_core.errors import LCollisionError, PoseSetError
+from lcollision_core.errors import LCollisionError, PoseSetError, listed
 from lcollision_core.files.table import POSES_SUFFIX, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.model_file import digest_of
@@ -477,6 +477,14 @@ def _asked_clips(
 ) -> dict[str, tuple[Path, str | None, float]]:
     """Return the file, clip and start time in seconds of each body that moves."""
     clip_of_body: dict[str, tuple[Path, str | None, float]] = {}
+    all_clips = dict.fromkeys(
+        own for name in body.plays for own in body.member(name).body.own_clips
+    )
+    if clip is not None and clip not in all_clips:
+        clip_names = listed(map(repr, all_clips)) or "none"
+        raise LCollisionError(
+            f"has no clip {clip!r}", f"its clips are {clip_names}", where=body.name
+        )
     for name, (first_clip, start) in body.plays.items():
         member = body.member(name)
         assert member.body.own_file is not None
@@ -485,7 +493,9 @@ def _asked_clips(
     for entry in played:
         name, equals, what = entry.partition("=")
         member = body.member(name)
-        what, _, seconds = what.rpartition("@") if "@" in what else (what, "", "0")
+        seconds = "0"
+        if "@" in what and what not in member.body.own_clips and not Path(what).is_file():
+            what, _, seconds = what.rpartition("@")
         try:
             start = float(seconds)
         except ValueError:

@@ -123,8 +123,14 @@ def test_a_motion_without_its_body_is_refused_in_a_scene(
     assert refused.endswith(
         f"walk.bvh is no body of the scene; say who moves by it: --play 'hero={walk}'"
     )
-    play = ("--play", f"hero={walk}")
+    # Unity names motions like this.
+    play = ("--play", f"hero={walk.rename(tmp_path / 'hero@walk.bvh')}")
     assert lcollision("resolve", "--motion", hero, *scene, *play, "-o", f"{out}/").exit_code == 0
+    for command in (("check", "--clips"), ("resolve", "--motion", "-o", f"{out}/")):
+        refused = refusal(lcollision, *command, hero, *scene, "--clip", "wlak")
+        assert refused.endswith(
+            f"has no clip 'wlak'; its clips are {open_body(hero).own_clips[0]!r}"
+        )
 
 
 def test_what_moves_before_a_clip_starts_is_reported_as_it_is_played(
