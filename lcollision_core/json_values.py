@@ -39,6 +39,8 @@ def parse_json(content: bytes) -> Any:
         raise ValueError(f"its values would take more than {MAX_MEMORY >> 20} MiB of memory")
     try:
         return json.loads(content.decode("utf-8-sig"), parse_constant=_refuse_constant)
+    except UnicodeDecodeError as error:
+        raise ValueError("its text is not UTF-8") from error
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
 

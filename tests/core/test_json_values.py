@@ -10,7 +10,7 @@ import pytest
 from msgspec import Meta
 
 from lcollision_core.errors import ShapeError
-from lcollision_core.json_values import from_json, to_json
+from lcollision_core.json_values import from_json, parse_json, to_json
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,12 @@ def test_values_come_back_as_their_types() -> None:
     assert from_json(Whole, {"parts": [], "weights": [1], "later": 3}, "whole") == Whole((), (1.0,))
     # A file name that is not valid text, as stored by an older version.
     assert from_json(Part, {"name": "\udcffbend"}, "part").name == "?bend"
+
+
+def test_text_of_another_encoding_is_said() -> None:
+    assert parse_json(b"\xef\xbb\xbf[]") == []
+    with pytest.raises(ValueError, match=r"^its text is not UTF-8$"):
+        parse_json("[]".encode("utf-16"))
 
 
 @pytest.mark.parametrize(
