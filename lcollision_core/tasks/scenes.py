@@ -426,7 +426,8 @@ def scene_motion(
             motions.append(PlayedMotion(member, None, None, 0))
             continue
         file, clip, seconds = asked_clips[member.name]
-        motion = read_motions(member.body, file, clip, rate, job.part())[0].at_rate(rate)
+        motion = read_motions(member.body, file, clip, rate, job.part())[0]
+        motion = _moved_by_codes(member.body, motion).at_rate(rate)
         motions.append(PlayedMotion(member, motion, file, round(seconds * rate)))
     moving = [(of_body, of_body.motion) for of_body in motions if of_body.motion is not None]
     n = max(of_body.start + len(motion) for of_body, motion in moving)
@@ -438,6 +439,18 @@ def scene_motion(
     files = dict.fromkeys(of_body.file.name for of_body, _ in moving if of_body.file is not None)
     space_at = _space_at(body, moving)
     return Motion(names, np.arange(n) / rate, codes, None, space_at, " + ".join(files)), motions
+
+
+def _moved_by_codes(body: Body, motion: Motion) -> Motion:
+    """Return a motion whose placements, as of a point cache, are codes of the whole body."""
+    joints, places = body.joints, motion.placements
+    if joints is None or places is None:
+        return motion
+    rows = zip(places, map(joints.transforms, motion.codes), strict=True)
+    placed = [moves if place is None else place.matrix @ moves for place, moves in rows]
+    codes = joints.unwound(joints.codes_of_transforms(np.array(placed)))
+    codes[:, body.shape_codes] = motion.codes[:, body.shape_codes]
+    return replace(motion, codes=codes, placements=None)
 
 
 def _space_at(

@@ -19,6 +19,7 @@ from lcollision_core.bodies.scene_file import (
 )
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.files import read_character, write_mesh
+from lcollision_core.files.motion.caches import write_point_cache
 from lcollision_core.options import ExportRequest, MotionChoice, ResolveOptions
 from lcollision_core.posing import DragOptions, Grip
 from lcollision_core.tasks.exporting import write_members
@@ -279,6 +280,19 @@ def test_a_prop_plays_its_own_clip_unless_it_is_held(
     assert 0 < collides.sum() < len(collides) == len(frames.times)
     held = body_of_scene(SceneFile((parts[0], replace(parts[1], held_by="hero", joint="LeftHand"))))
     assert held.notes == ("axe: it is held, so its own clips are left out",)
+
+
+def test_a_point_cache_moves_a_whole_body_of_a_scene(folder: Path, tmp_path: Path) -> None:
+    body = body_of_scene(SceneFile((ScenePart(str(folder / "hero.glb")),), "rest"))
+    hero, walk = body.members[0].body, tmp_path / "walk.pc2"
+    codes = 0.2 * np.random.default_rng(2).normal(size=(4, hero.latent_size))
+    steps = np.linspace(0.0, 2.0, 4)[:, None, None] * [0.0, 0.0, 1.0]
+    frames = hero.decode(codes) * [-1.0, 1.0, -1.0] + steps
+    write_point_cache(walk, frames, fps=30.0)
+    motion, _ = scene_motion(body, (f"hero={walk}",), MotionChoice())
+    check, rows = body.exact_check(), body.vertices_of["hero"]
+    for number, frame in enumerate(frames):
+        assert np.allclose(motion.vertices(number, check)[rows], frame, atol=1e-5)
 
 
 def test_a_prop_elsewhere_comes_to_the_joint_that_holds_it(tmp_path: Path, folder: Path) -> None:
