@@ -45,6 +45,8 @@ from lcollision_core.bundled import user_folder
 from lcollision_core.errors import LCollisionError, PoseSetError, listed
 from lcollision_core.files.table import POSES_SUFFIX, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.meshes import RigidTransform
+from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import digest_of
 from lcollision_core.motion.motion import Motion, runs
 from lcollision_core.options import ExportRequest, MotionChoice, SceneOptions
@@ -318,7 +320,9 @@ def read_scene_poses(
                 continue
             try:
                 if path.suffix.lower() == POSES_SUFFIX:
-                    poses_of[member.name] = list(read_some_poses(path, member.body))
+                    poses_of[member.name] = [
+                        _placed(member.body, pose) for pose in read_some_poses(path, member.body)
+                    ]
                 else:
                     poses_of[member.name] = [_encoded(member, path, scale, job)]
             except (PoseSetError, OtherModelError) as error:
@@ -349,6 +353,14 @@ def read_scene_poses(
         source = " + ".join(sources) or body.name
         poses.append(InputPose(f"{source}: {name}" if n_poses > 1 else source, pose))
     return poses
+
+
+def _placed(body: Body, pose: NamedPose) -> NamedPose:
+    """Return a pose whose placement became codes of the whole body."""
+    if pose.placement is None:
+        return pose
+    (latent,) = _placed_codes(body, pose.latent[None], [pose.placement])
+    return replace(pose, latent=latent, placement=None)
 
 
 def _encoded(member: SceneMember, path: Path, scale: float, job: Job) -> NamedPose:
@@ -443,14 +455,25 @@ def scene_motion(
 
 def _moved_by_codes(body: Body, motion: Motion) -> Motion:
     """Return a motion whose placements, as of a point cache, are codes of the whole body."""
-    joints, places = body.joints, motion.placements
-    if joints is None or places is None:
+    if body.joints is None or motion.placements is None:
         return motion
-    rows = zip(places, map(joints.transforms, motion.codes), strict=True)
+    return replace(
+        motion, codes=_placed_codes(body, motion.codes, motion.placements), placements=None
+    )
+
+
+def _placed_codes(
+    body: Body, codes: FloatArray, places: Sequence[RigidTransform | None]
+) -> FloatArray:
+    """Return (N, D) codes of poses with placements; those of a body without joints are left out."""
+    joints = body.joints
+    if joints is None:
+        return codes
+    rows = zip(places, map(joints.transforms, codes), strict=True)
     placed = [moves if place is None else place.matrix @ moves for place, moves in rows]
-    codes = joints.unwound(joints.codes_of_transforms(np.array(placed)))
-    codes[:, body.shape_codes] = motion.codes[:, body.shape_codes]
-    return replace(motion, codes=codes, placements=None)
+    result = joints.unwound(joints.codes_of_transforms(np.array(placed)))
+    result[:, body.shape_codes] = codes[:, body.shape_codes]
+    return result
 
 
 def _space_at(

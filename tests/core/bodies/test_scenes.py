@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.sparse import random as random_sparse
 
-from lcollision_core.bodies import NamedPose, open_body
+from lcollision_core.bodies import NamedPose, open_body, write_poses
 from lcollision_core.bodies.scene_body import SceneBody, SceneFile, ScenePart
 from lcollision_core.bodies.scene_file import (
     body_of_scene,
@@ -24,7 +24,7 @@ from lcollision_core.options import ExportRequest, MotionChoice, ResolveOptions
 from lcollision_core.posing import DragOptions, Grip
 from lcollision_core.tasks.exporting import write_members
 from lcollision_core.tasks.opening import open_any
-from lcollision_core.tasks.scenes import scene_motion
+from lcollision_core.tasks.scenes import read_scene_poses, scene_motion
 from tests.core.gltf_builder import GltfBuilder, rotation
 from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import FloatArray, rigged_body, write_gltf
@@ -291,6 +291,10 @@ def test_a_point_cache_moves_a_whole_body_of_a_scene(folder: Path, tmp_path: Pat
     write_point_cache(walk, frames, fps=30.0)
     motion, _ = scene_motion(body, (f"hero={walk}",), MotionChoice())
     check, rows = body.exact_check(), body.vertices_of["hero"]
+    pose, poses = hero.encode(frames[3]), tmp_path / "poses.json"
+    write_poses(poses, hero, [NamedPose("a", pose.latent, pose.placement)])
+    (given,) = read_scene_poses(body, [poses], 1.0)
+    assert np.allclose(body.decode(given.pose.latent)[rows], frames[3], atol=1e-5)
     for number, frame in enumerate(frames):
         assert np.allclose(motion.vertices(number, check)[rows], frame, atol=1e-5)
 
