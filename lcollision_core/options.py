@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files.table import WRITABLE_SUFFIXES
+from lcollision_core.files.formats import WRITABLE_SUFFIXES
 
 if TYPE_CHECKING:
     import numpy as np

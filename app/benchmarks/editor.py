@@ -61,7 +61,7 @@ from app.work.compile_ahead import AHEAD
 from app.work.threads import Failure
 from lcollision_core.bodies import find_model
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files.table import SCENE_SUFFIXES
+from lcollision_core.files.formats import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 
 if TYPE_CHECKING:

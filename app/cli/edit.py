@@ -10,7 +10,7 @@ import typer
 from app.cli.contacts import keep_rules
 from app.cli.options import takes_options
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files.table import POSES_SUFFIX
+from lcollision_core.files.formats import POSES_SUFFIX
 from lcollision_core.options import NO_CHANGE, RuleOptions
 
 

@@ -118,7 +118,7 @@ def info(
 def _being_learned(name_or_path: str) -> dict[str, Any] | None:
     """Return the progress of a model that `lcollision new` has begun, else None."""
     from lcollision_core.bodies.learned_body import user_models_folder, work_path
-    from lcollision_core.files.table import MODEL_SUFFIX
+    from lcollision_core.files.formats import MODEL_SUFFIX
 
     path = Path(name_or_path)
     if len(path.parts) <= 1 and path.suffix != MODEL_SUFFIX:

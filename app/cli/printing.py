@@ -50,7 +50,7 @@ def print_figure(
     Exits with 1 if the pose could not be resolved; the file is still written, with the colliding
     parts merged.
     """
-    from lcollision_core.files.table import PRINT_SUFFIXES
+    from lcollision_core.files.formats import PRINT_SUFFIXES
     from lcollision_core.tasks.exporting import refuse_to_replace, require_output, source_files
     from lcollision_core.tasks.inputs import read_input_poses
     from lcollision_core.tasks.printing import print_pose

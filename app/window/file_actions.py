@@ -39,7 +39,7 @@ from app.window.dialogs.questions import (
 from app.window.widgets import ListMenu, plain_tip
 from app.work.threads import as_task
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files.table import (
+from lcollision_core.files.formats import (
     CHARACTER_SUFFIXES,
     FILES,
     LEARNED_FROM,

@@ -12,7 +12,7 @@ from PySide6.QtCore import QObject, Qt, QTimer, Slot
 from app.window.dialogs.questions import Choice, ask_about_recovery
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files.table import MODEL_SUFFIX, POSES_SUFFIX
+from lcollision_core.files.formats import MODEL_SUFFIX, POSES_SUFFIX
 from lcollision_core.tasks.opening import AnimationAlone, OtherMesh
 
 if TYPE_CHECKING:

@@ -34,13 +34,13 @@ from lcollision_core.files import (
     written_frame,
 )
 from lcollision_core.files.character_writing import NewClip, write_character_clips
-from lcollision_core.files.mesh.obj import ObjDetail, rewrite_obj
-from lcollision_core.files.motion.caches import point_cache, read_frame
-from lcollision_core.files.table import (
+from lcollision_core.files.formats import (
     POINT_CACHE_SUFFIXES,
     SCENE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
+from lcollision_core.files.mesh.obj import ObjDetail, rewrite_obj
+from lcollision_core.files.motion.caches import point_cache, read_frame
 from lcollision_core.meshes import FaceGroup, RigidTransform, body_size
 from lcollision_core.meshes.face_groups import GROUP_KINDS
 from lcollision_core.meshes.normals import corner_normals

@@ -25,6 +25,7 @@ from lcollision_core.bodies.names import (
 from lcollision_core.bundled import bundled_folder, user_folder
 from lcollision_core.embedding.bilevel import BOX_ARRAYS, Embedding, LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.files.formats import MODEL_SUFFIX
 from lcollision_core.files.safe import (
     FileStamp,
     file_stamp,
@@ -32,7 +33,6 @@ from lcollision_core.files.safe import (
     locked,
     unused_name,
 )
-from lcollision_core.files.table import MODEL_SUFFIX
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import ContactRules, body_size
 from lcollision_core.meshes.face_groups import ignored_faces_digest
@@ -285,7 +285,7 @@ class LearnedBody(Body):
         """
         from lcollision_core.bodies.export import own_source
         from lcollision_core.files import read_character
-        from lcollision_core.files.table import SCENE_SUFFIXES
+        from lcollision_core.files.formats import SCENE_SUFFIXES
 
         path = own_source(self)
         if path is None or path.suffix.lower() not in SCENE_SUFFIXES:

@@ -47,6 +47,13 @@ from lcollision_core.files.changed_clips import ChangedClip, FileClips, changed_
 from lcollision_core.files.character import ClipFrames
 from lcollision_core.files.character_reading import character_of, character_of_smpl
 from lcollision_core.files.character_writing import require_written
+from lcollision_core.files.formats import (
+    ANIMATED_SUFFIXES,
+    BVH_SUFFIX,
+    MOTION_SUFFIXES,
+    SCENE_SUFFIXES,
+    SKELETON_SUFFIXES,
+)
 from lcollision_core.files.motion.bvh import read_bvh
 from lcollision_core.files.motion.generated import is_generated
 from lcollision_core.files.motion.smpl import (
@@ -59,13 +66,6 @@ from lcollision_core.files.pose_set_reading import frame_rate
 from lcollision_core.files.safe import atomic_write, write_bytes
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene_files import open_rigged, read_scene
-from lcollision_core.files.table import (
-    ANIMATED_SUFFIXES,
-    BVH_SUFFIX,
-    MOTION_SUFFIXES,
-    SCENE_SUFFIXES,
-    SKELETON_SUFFIXES,
-)
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.extents import box_corners

@@ -31,10 +31,10 @@ from lcollision_core.files import (
     with_up_axis,
     without_user_choices,
 )
+from lcollision_core.files.formats import FILES, MODEL_SUFFIX, SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.files.motion.smpl import refuse_pickle
 from lcollision_core.files.safe import read_regular, write_bytes
 from lcollision_core.files.scene_files import SceneDocument, open_scene
-from lcollision_core.files.table import FILES, MODEL_SUFFIX, SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.json_values import from_json, parse_document
 from lcollision_core.meshes import ContactRules, Topology
 from lcollision_core.meshes.topology import FloatArray

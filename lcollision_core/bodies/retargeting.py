@@ -40,6 +40,7 @@ from lcollision_core.bodies.standing_pose import (
 from lcollision_core.errors import MeshFileError, listed
 from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.character_reading import is_gltf
+from lcollision_core.files.formats import BVH_SUFFIX, SKELETON_SUFFIXES, VRMA_SUFFIX
 from lcollision_core.files.gltf.read import human_bones
 from lcollision_core.files.motion.bvh import Bvh, bvh_bytes, depth_first, read_bvh
 from lcollision_core.files.motion.generated import is_generated, read_generated
@@ -56,7 +57,6 @@ from lcollision_core.files.safe import write_bytes
 from lcollision_core.files.scene.scene import nearest_above
 from lcollision_core.files.scene.transforms import from_rotation_vectors, rotation_vectors
 from lcollision_core.files.scene_files import as_file_error, read_skeleton_scene
-from lcollision_core.files.table import BVH_SUFFIX, SKELETON_SUFFIXES, VRMA_SUFFIX
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.trees import lineage

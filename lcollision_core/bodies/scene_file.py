@@ -22,9 +22,9 @@ from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember, ScenePart
 from lcollision_core.errors import LCollisionError, ModelFileError, listed
 from lcollision_core.files import Character, ClipFrames, Rig, read_character, read_mesh
+from lcollision_core.files.formats import READABLE_SUFFIXES, SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.files.safe import read_regular, write_bytes
 from lcollision_core.files.scene.transforms import from_rotation_vectors
-from lcollision_core.files.table import READABLE_SUFFIXES, SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.json_values import from_json, parse_document, parse_json
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.alignment import fit_rigid

@@ -21,6 +21,7 @@ from lcollision_core.files.character import (
     Rig,
     Shapes,
 )
+from lcollision_core.files.formats import GLTF_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.gltf.write import gltf_of
 from lcollision_core.files.mesh_file import turn_to_y
@@ -36,7 +37,6 @@ from lcollision_core.files.scene_files import (
     read_scene,
     scene_of,
 )
-from lcollision_core.files.table import GLTF_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.extents import body_size, box_corners, guess_up
 from lcollision_core.meshes.topology import FloatArray, Topology

@@ -28,6 +28,7 @@ from lcollision_core.files.character import (
     blended,
 )
 from lcollision_core.files.character_reading import character_of
+from lcollision_core.files.formats import GLTF_SUFFIXES
 from lcollision_core.files.gltf.read import read_shown
 from lcollision_core.files.gltf.schema import PARTS, VERTEX_DATA, GltfDocument, stored_parts
 from lcollision_core.files.mesh.polygons import MAX_FILE_BYTES
@@ -44,7 +45,6 @@ from lcollision_core.files.scene.scene import (
 )
 from lcollision_core.files.scene.transforms import compose, decompose, signs_on_one_side
 from lcollision_core.files.scene_files import SceneDocument, as_file_error, scene_of
-from lcollision_core.files.table import GLTF_SUFFIXES
 from lcollision_core.json_values import quoted
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules
 from lcollision_core.meshes.extents import body_size

@@ -12,6 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, ShapeError
+from lcollision_core.files.formats import (
+    FILES,
+    READABLE_SUFFIXES,
+    SCENE_SUFFIXES,
+    WRITABLE_SUFFIXES,
+    function_of,
+)
 from lcollision_core.files.mesh.obj import ObjDetail
 from lcollision_core.files.mesh.obj import encode as encode_obj
 from lcollision_core.files.mesh.polygons import (
@@ -25,13 +32,6 @@ from lcollision_core.files.safe import write_bytes
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene.scene import Scene
 from lcollision_core.files.scene_files import as_file_error, document_of, opened, scene_of
-from lcollision_core.files.table import (
-    FILES,
-    READABLE_SUFFIXES,
-    SCENE_SUFFIXES,
-    WRITABLE_SUFFIXES,
-    function_of,
-)
 from lcollision_core.meshes.precision import (
     LARGEST_RATIO,
     first_not_finite,

@@ -14,6 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError, listed
+from lcollision_core.files.formats import (
+    ANIMATED_SUFFIXES,
+    FILES,
+    GLTF_SUFFIXES,
+    POINT_CACHE_SUFFIXES,
+    READABLE_SUFFIXES,
+    SCENE_SUFFIXES,
+)
 from lcollision_core.files.mesh_file import (
     KEEP_PRECISION,
     Mesh,
@@ -36,14 +44,6 @@ from lcollision_core.files.safe import MAX_ITEMS, read_npz
 from lcollision_core.files.scene.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.files.scene.scene import MAX_FRAME_NUMBERS, Scene, parents_first
 from lcollision_core.files.scene_files import as_file_error, read_scene
-from lcollision_core.files.table import (
-    ANIMATED_SUFFIXES,
-    FILES,
-    GLTF_SUFFIXES,
-    POINT_CACHE_SUFFIXES,
-    READABLE_SUFFIXES,
-    SCENE_SUFFIXES,
-)
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION, ContactRules
 from lcollision_core.meshes.extents import body_size

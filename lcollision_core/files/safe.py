@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import FileLockedError, MeshFileError
-from lcollision_core.files.table import FILES
+from lcollision_core.files.formats import FILES
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import BinaryIO, TypeAlias
 
 from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError
+from lcollision_core.files.formats import SCENE_SUFFIXES
 from lcollision_core.files.gltf import read as gltf_scene
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.mesh.polygons import read_rest
@@ -17,7 +18,6 @@ from lcollision_core.files.safe import open_regular
 from lcollision_core.files.scene import fbx
 from lcollision_core.files.scene.fbx import FbxDocument
 from lcollision_core.files.scene.scene import NoMeshError, Scene, shown_scene
-from lcollision_core.files.table import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 
 SceneDocument: TypeAlias = GltfDocument | FbxDocument

@@ -31,12 +31,12 @@ from lcollision_core.compiled import working_seconds
 from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files import Mesh, audit_mesh, read_mesh, read_pose_set
+from lcollision_core.files.formats import ANIMATED_SUFFIXES, SCENE_SUFFIXES
 from lcollision_core.files.motion.generated import is_generated
 from lcollision_core.files.pose_set_reading import frame_rate
 from lcollision_core.files.safe import write_table
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene_files import open_rigged, read_scene
-from lcollision_core.files.table import ANIMATED_SUFFIXES, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import STRICT, ContactRules, FaceGroup, Topology
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION

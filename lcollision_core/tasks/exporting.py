@@ -51,8 +51,7 @@ from lcollision_core.files import (
     unused_name,
 )
 from lcollision_core.files.character_writing import require_written
-from lcollision_core.files.safe import require_folder
-from lcollision_core.files.table import (
+from lcollision_core.files.formats import (
     BVH_SUFFIX,
     OWN_SUFFIXES,
     POINT_CACHE_SUFFIXES,
@@ -60,6 +59,7 @@ from lcollision_core.files.table import (
     SKELETON_SUFFIXES,
     WRITABLE_SUFFIXES,
 )
+from lcollision_core.files.safe import require_folder
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.motion import KeptSpan, Motion, MotionReport, Reason
 from lcollision_core.motion.motion import runs

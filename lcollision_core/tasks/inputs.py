@@ -30,17 +30,17 @@ from lcollision_core.errors import (
     listed,
 )
 from lcollision_core.files import PoseSet, mesh_files
-from lcollision_core.files.mesh_file import KEEP_PRECISION
-from lcollision_core.files.motion.generated import holds_joints, is_generated
-from lcollision_core.files.motion.smpl import array_names, is_smpl_motion
-from lcollision_core.files.pose_set_reading import natural_key
-from lcollision_core.files.scene_files import open_rigged, read_scene
-from lcollision_core.files.table import (
+from lcollision_core.files.formats import (
     POINT_CACHE_SUFFIXES,
     READABLE_SUFFIXES,
     SCENE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
+from lcollision_core.files.mesh_file import KEEP_PRECISION
+from lcollision_core.files.motion.generated import holds_joints, is_generated
+from lcollision_core.files.motion.smpl import array_names, is_smpl_motion
+from lcollision_core.files.pose_set_reading import natural_key
+from lcollision_core.files.scene_files import open_rigged, read_scene
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import RuleOptions
 from lcollision_core.tasks.exporting import Output, write_result

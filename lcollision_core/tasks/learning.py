@@ -24,7 +24,7 @@ from lcollision_core.embedding.training import require_several
 from lcollision_core.embedding.training_run import EmbeddingConfig, TrainingStatus
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
 from lcollision_core.files import PoseSet, read_pose_set, write_pose_set
-from lcollision_core.files.table import SCENE_SUFFIXES
+from lcollision_core.files.formats import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.json_values import from_json, to_json
 from lcollision_core.labels import LabelStatus, LabelStore, label_poses

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from lcollision_core.errors import MeshFileError, ModelFileError, PoseSetError, WrongScaleError
-from lcollision_core.files.table import MODEL_SUFFIX, SCENE_SUFFIXES
+from lcollision_core.files.formats import MODEL_SUFFIX, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import MotionChoice
 

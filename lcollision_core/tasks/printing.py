@@ -13,8 +13,8 @@ import numpy.typing as npt
 from lcollision_core.bodies import Body, NamedPose
 from lcollision_core.contact import solids
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files.formats import FILES, PRINT_SUFFIXES, function_of
 from lcollision_core.files.safe import write_bytes
-from lcollision_core.files.table import FILES, PRINT_SUFFIXES, function_of
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import named_group
 from lcollision_core.options import PrintOptions, ResolveOptions

@@ -43,7 +43,7 @@ from lcollision_core.bodies.scene_file import (
 )
 from lcollision_core.bundled import user_folder
 from lcollision_core.errors import LCollisionError, PoseSetError, listed
-from lcollision_core.files.table import POSES_SUFFIX, SCENE_SUFFIXES
+from lcollision_core.files.formats import POSES_SUFFIX, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray

@@ -26,11 +26,11 @@ from lcollision_core.files import (
     read_pose_set,
     thinned,
 )
+from lcollision_core.files.formats import SCENE_SUFFIXES
 from lcollision_core.files.motion.smpl import is_smpl_model
 from lcollision_core.files.pose_set import disagreement
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene_files import as_file_error, open_rigged, read_scene
-from lcollision_core.files.table import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import Topology, UpGuess, body_size, guess_up
 from lcollision_core.meshes.contact_rules import TOUCHING_RADIUS

@@ -22,8 +22,8 @@ from lcollision_core.bodies.learned_body import (
     work_path,
 )
 from lcollision_core.errors import FileLockedError, LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.files.formats import MODEL_SUFFIX
 from lcollision_core.files.safe import file_stamp, locked, read_regular, write_bytes
-from lcollision_core.files.table import MODEL_SUFFIX
 from lcollision_core.json_values import from_json, parse_json, to_json
 from lcollision_core.learning_state import LearningStatus, RunState, Stage
 from lcollision_core.model_file import digest_of

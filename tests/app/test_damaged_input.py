@@ -35,10 +35,10 @@ from lcollision_core.files import (
     write_mesh,
     write_pose_set,
 )
+from lcollision_core.files.formats import READABLE_SUFFIXES
 from lcollision_core.files.motion.bvh import read_bvh
 from lcollision_core.files.motion.caches import read_point_cache, write_point_cache
 from lcollision_core.files.safe import open_regular
-from lcollision_core.files.table import READABLE_SUFFIXES
 from lcollision_core.labels import StoreIdentity
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.model_file import FORMAT_VERSION, Section, digest_of, read_model_file

@@ -24,7 +24,7 @@ from app.editing.settings import SETTINGS, Settings
 from app.view.theme import NORMAL, WIDE
 from app.window.dialogs.questions import Dialog
 from app.window.widgets import NumberBox, labelled, push_button, swatch_icon
-from lcollision_core.files.table import FILES, WRITABLE_SUFFIXES
+from lcollision_core.files.formats import FILES, WRITABLE_SUFFIXES
 from lcollision_core.options import ExportRequest, PrintOptions
 from lcollision_core.tasks.words import menu_text
 

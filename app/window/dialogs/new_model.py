@@ -762,7 +762,7 @@ class NewModelDialog(Dialog):
 
     @Slot()
     def _ask_for_files(self) -> None:
-        from lcollision_core.files.table import LEARNED_FROM, SCENE_SUFFIXES
+        from lcollision_core.files.formats import LEARNED_FROM, SCENE_SUFFIXES
 
         masks = " ".join(f"*{suffix}" for suffix in (*SCENE_SUFFIXES, *LEARNED_FROM))
         folder = self._settings["last_folder"]

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, ShapeError
+from lcollision_core.files.formats import POINT_CACHE_SUFFIXES
 from lcollision_core.files.safe import MAX_ITEMS, atomic_write, open_regular
-from lcollision_core.files.table import POINT_CACHE_SUFFIXES
 
 _PC2_MAGIC = b"POINTCACHE2\0"
 _PC2_HEADER = np.dtype(

@@ -19,10 +19,10 @@ import scipy
 
 from lcollision_core.bundled import bundled_table
 from lcollision_core.errors import LCollisionError, MeshFileError
+from lcollision_core.files.formats import SMPL_SUFFIX
 from lcollision_core.files.motion.skeleton import SkeletonMotion
 from lcollision_core.files.safe import ZIP_DAMAGE, read_npz
 from lcollision_core.files.scene.transforms import from_rotation_vectors, nearest_winding
-from lcollision_core.files.table import SMPL_SUFFIX
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 PICKLE_SUFFIXES = (".pkl", ".pickle")

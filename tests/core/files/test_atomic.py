@@ -10,7 +10,7 @@ import pytest
 
 from lcollision_core.errors import MeshFileError, PoseSetError, ShapeError
 from lcollision_core.files import atomic_write, read_mesh, write_mesh
-from lcollision_core.files.table import WRITABLE_SUFFIXES
+from lcollision_core.files.formats import WRITABLE_SUFFIXES
 
 VERTICES = np.array([[0.1, 0.2, 0.3], [1, 0, 0], [0, 1, 0], [1 / 3, 2 / 3, -0.7]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3]], dtype=np.int32)

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import Mesh, read_mesh, read_pose_set, write_mesh
+from lcollision_core.files.formats import WRITABLE_SUFFIXES
 from lcollision_core.files.mesh import obj
 from lcollision_core.files.mesh.polygons import first_at_each_position
 from lcollision_core.files.mesh.text import number_rows, points
-from lcollision_core.files.table import WRITABLE_SUFFIXES
 from lcollision_core.meshes import Topology
 from lcollision_core.meshes.precision import can_hold
 from tests.core.background import peak_memory

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
+from lcollision_core.files.formats import POINT_CACHE_SUFFIXES
 from lcollision_core.files.motion import caches
 from lcollision_core.files.motion.caches import (
     cache_rate,
@@ -14,7 +15,6 @@ from lcollision_core.files.motion.caches import (
     read_point_cache,
     write_point_cache,
 )
-from lcollision_core.files.table import POINT_CACHE_SUFFIXES
 from tests.core.background import peak_memory
 
 FRAMES = np.arange(2 * 4 * 3, dtype=np.float32).reshape(2, 4, 3) / 7.0

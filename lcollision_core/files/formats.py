@@ -1,4 +1,4 @@
-"""Table of file extensions: their content, reader, writer and label.
+"""The file formats by extension: their content, reader, writer and label.
 
 It is the only such list: to add a format, add an entry to `FILES`, and a module with the functions
 that it names.

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import lcollision_core
-from lcollision_core.files.table import FILES, Holds, function_of, suffixes_of
+from lcollision_core.files.formats import FILES, Holds, function_of, suffixes_of
 
 CORE = Path(lcollision_core.__file__).parent
 
@@ -51,6 +51,6 @@ def _suffixes(node: ast.Tuple | ast.List | ast.Set) -> int:
 
 
 def test_the_table_loads_no_reader() -> None:
-    code = "import lcollision_core.files.table, sys; print(*sys.modules)"
+    code = "import lcollision_core.files.formats, sys; print(*sys.modules)"
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert not {"numpy", "scipy", "trimesh"} & set(printed.stdout.split())
