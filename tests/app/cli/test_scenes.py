@@ -41,6 +41,16 @@ def test_two_bodies_are_checked_and_resolved_each_to_its_own_file(
     assert lcollision("check", out / "hero.glb", *again).exit_code == 0
 
 
+def test_a_learned_model_is_checked_beside_a_character(lcollision: Lcollision, hero: Path) -> None:
+    far = lcollision("check", "--json", hero, "--with", "body", "--at", "body=50,0,0")
+    assert far.exit_code == 0, far.output
+    near = lcollision("check", "--json", hero, "--with", "body")
+    assert near.exit_code == 1
+    (row,) = json.loads(near.stdout)
+    assert row["vertices"] == open_body(hero).n_vertices + open_body("body").n_vertices
+    assert all("hero: " in part and "body: " in part for part in row["parts"])
+
+
 def test_random_poses_of_a_scene_are_written_body_by_body(
     lcollision: Lcollision, hero: Path, tmp_path: Path
 ) -> None:
