@@ -1,4 +1,4 @@
-"""Whole sentences of verdicts and reports: a translation sets its catalogue as `CATALOGUE`.
+"""Whole sentences for people: a translation sets its catalogue as `CATALOGUE`.
 
 `xgettext -k say -k say_number:2,3 -k counted:2,3 -k marked` collects them: each is a literal with
 named fields.
@@ -29,7 +29,7 @@ def counted(number: int, noun: str, nouns: str) -> str:
 
 
 def both(first: str, second: str) -> str:
-    """Name two things, or one that is both."""
+    """Join two names by "and"; equal ones are given once."""
     return first if first == second else say("{first} and {second}", first=first, second=second)
 
 

@@ -354,7 +354,9 @@ def _resolve_motions(
     elif request.files:
         file, name = request.files[0], scene.members[0].name
         raise LCollisionError(
-            "is no body of the scene", f"say who moves by it: --play '{name}={file}'", where=file
+            "is a motion, not a body of the scene",
+            f"assign it with --play '{name}={file}'",
+            where=file,
         )
     each = scene is None and request.has_output_each
     if request.only_check and not each:

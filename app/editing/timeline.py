@@ -447,10 +447,11 @@ class Timeline(QObject):
 
     def _at(self, motion: Motion, frame: int, held: PoseFrame | None = None) -> DocumentState:
         """Return the state at a frame, with the pins moved to its patches."""
-        from lcollision_core.bodies import NamedPose, unique_names
+        from lcollision_core.bodies import MAX_POSE_NAME_LENGTH, NamedPose
 
         codes = motion.codes[frame] if held is None else held.latent
-        (name,) = unique_names([f"{motion.name} {frame}"])
+        ending = f" {frame}"
+        name = motion.name[: MAX_POSE_NAME_LENGTH - len(ending)] + ending
         pose = NamedPose(name, codes, motion.placement(frame))
         moment = Moment(motion, frame)
         state = DocumentState(pose, moment=moment, ghost=self._ghost(motion, frame))

@@ -174,6 +174,7 @@ class FileActions(QObject):
 
     def _import_mesh(self, path: Path, is_asked: bool = True) -> None:
         self._require_model(path)
+        self._carried = None
         self._document.tasks.import_mesh(path, is_asked_as_mesh=is_asked)
         self._remember_folder(path)
 
@@ -657,19 +658,23 @@ class FileActions(QObject):
         """Ask about edited motions; see `confirm_losing_changes`."""
         document = self._document
         document.tasks.wait_for_saves()
-        if document.has_model and not document.timeline.are_saved():
+        # An export of frames is of one motion; others are asked about again.
+        while document.has_model and not document.timeline.are_saved():
             changed = [now.name for _, now in document.timeline.changes]
             answer = ask_about_motions(self._window, changed)
-            if answer is Choice.SAVE and self.export_motion():
-                wait_for_exports(
-                    self._window,
-                    document,
-                    self._viewport.pictures,
-                    "Exporting",
-                    "What you asked for follows once that is done.",
-                )
-                return document.timeline.are_saved()
-            return answer is Choice.DISCARD
+            if answer is Choice.DISCARD:
+                return True
+            if answer is Choice.CANCEL or not self.export_motion():
+                return False
+            written = wait_for_exports(
+                self._window,
+                document,
+                self._viewport.pictures,
+                "Exporting",
+                "Your command continues once that is done.",
+            )
+            if not written:
+                return False
         return True
 
     def confirm_losing_pose(self) -> bool:

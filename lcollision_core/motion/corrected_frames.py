@@ -278,7 +278,12 @@ class CorrectedFrames:
         return self.problem.guard.faults(span, self.codes, self.is_free, fractions)
 
     def take(self, span: range, codes: FloatArray) -> dict[int, Reason]:
-        """Set the (len(span), D) codes of a span, unless that makes frames worse: return these."""
+        """Set the (len(span), D) codes of a span, unless that makes frames worse.
+
+        Returns
+        -------
+        faults : the frames that it would make worse, and why; the span then stays as it was
+        """
         own = self.problem.own(span)
         before = self.codes[own], self.is_free[own], self.is_changed[own]
         self.codes[own], self.is_changed[own] = codes, True

@@ -735,6 +735,7 @@ class Reason(StrEnum):
     BETWEEN = marked("resolving them makes in-between poses collide")
     JERKS = marked("resolving them makes the motion jerk")
     AS_WRITTEN = marked("the file format can't store the correction")
+    CLIP_STARTS_LATER = marked("the clip of a body that should move starts later")
     STOPPED = marked("resolving was stopped before they were free")
 
 

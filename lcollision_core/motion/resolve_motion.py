@@ -412,7 +412,7 @@ class _Resolution:
         return [span for span in corrected.spans() if is_open[problem.own(span)].any()]
 
     def _bar_faults(self, span: range, faults: Mapping[int, Reason]) -> None:
-        """Bar the colliding frames of a span that are nearest to faults; a stop bars all."""
+        """Bar the colliding frames of a span that are nearest to faults."""
         own, places = self.problem.own(span), self.problem.places(span)
         corrected = self.corrected
         inside = runs((corrected.colliding & ~corrected.barred)[own])

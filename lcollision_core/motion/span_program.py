@@ -35,9 +35,9 @@ _TOLERANCE, _MOST_ITERATIONS, _PATIENCE = 1e-8, 2000, 3
 """Tolerance of a half-space, most iterations, and most successive ones without progress."""
 
 _ADDED, _DROPPING_ROUNDS = 150, 30
-"""Half-spaces that a program begins with, those of least slack, and most violated ones that are
-added to its active ones in each round until none is violated: of thousands, few are active. Later
-rounds keep inactive ones too, as rounding could let the same ones come and go for ever."""
+"""A program begins with this many half-spaces, those of least slack. Each round adds as many, the
+most violated, until none is violated: of thousands, few are active. Inactive ones are dropped in
+the first rounds only, of this number, as rounding could let the same ones come and go for ever."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +186,8 @@ def least_corrections(
         active = rows[is_kept] if number < _DROPPING_ROUNDS else rows
         worst = np.argsort(left, kind="stable")[:_ADDED]
         added = worst[left[worst] < -_TOLERANCE]
+        if not len(added):
+            return None
     return moved
 
 

@@ -44,7 +44,7 @@ class SpanRecord:
 
     Attributes
     ----------
-    job, done : as given; the second may be replaced
+    job, done : as given; `done` may be replaced
     """
 
     def __init__(

@@ -24,7 +24,7 @@ LEAST_PASSES = 6
 
 
 class Architecture(Enum):
-    """The kinds of networks. mypy names the places that a further one needs."""
+    """The kinds of networks. mypy names the places that build and check a further one."""
 
     GEOMETRIC = auto()
     PAPER = auto()
@@ -86,7 +86,7 @@ class PredictorConfig:
     @property
     def architecture(self) -> Architecture:
         """The kind of the preset's network."""
-        return Architecture.PAPER if self.preset == "paper" else Architecture.GEOMETRIC
+        return ARCHITECTURES[self.preset]
 
     @property
     def described(self) -> str:
@@ -140,6 +140,13 @@ PRESETS = {
 }
 """The presets by name: the best by measurement for its time, a larger one of the same kind, and
 Tan et al. 2021, section Evaluation."""
+
+ARCHITECTURES = {
+    "default": Architecture.GEOMETRIC,
+    "large": Architecture.GEOMETRIC,
+    "paper": Architecture.PAPER,
+}
+"""The kind of each preset's network."""
 
 
 _EVERY = 10

@@ -648,6 +648,7 @@ def count_stuck(
     body: Body,
     collides: npt.NDArray[np.bool_],
     put_back: Sequence[range] = (),
+    reason: Reason = Reason.AS_WRITTEN,
 ) -> None:
     """Add frames that collide in the output to a row, with the reason.
 
@@ -666,7 +667,7 @@ def count_stuck(
     of_form += [(run, False) for run in runs(collides & ~named)]
     for span, is_original in of_form:
         ends = span.start, span.stop - 1
-        kept_span = KeptSpan(ends, Reason.AS_WRITTEN, is_original=is_original)
+        kept_span = KeptSpan(ends, reason, is_original=is_original)
         row.kept_spans.append(kept_span.to_json(body.domain_names))
 
 

@@ -194,6 +194,7 @@ def pose_of_member(body: Body, path: Path) -> MemberPose | None:
     LCollisionError : the file can't be read.
     """
     from lcollision_core.bodies import OtherModelError, as_scene, read_pose_file
+    from lcollision_core.tasks.scenes import placed_pose
 
     scene = as_scene(body)
     bodies = {} if scene is None else {m.name: m.body for m in scene.standing if m.moves}
@@ -205,8 +206,8 @@ def pose_of_member(body: Body, path: Path) -> MemberPose | None:
         fitting = tuple(
             name for name, other in bodies.items() if other.fingerprint == own.fingerprint
         )
-        for pose in content.all_poses if content.working is None else (content.working,):
-            return MemberPose(path, pose, fitting)
+        pose = content.working or next(iter(content.all_poses), None)
+        return None if pose is None else MemberPose(path, placed_pose(own, pose), fitting)
     return None
 
 

@@ -48,6 +48,7 @@ from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import digest_of
+from lcollision_core.motion.frames import Reason
 from lcollision_core.motion.motion import Motion, runs
 from lcollision_core.options import ExportRequest, MotionChoice, SceneOptions
 from lcollision_core.tasks.exporting import (
@@ -61,7 +62,7 @@ from lcollision_core.tasks.exporting import (
 from lcollision_core.tasks.inputs import InputPose, read_some_poses
 from lcollision_core.tasks.resolving import ResolveMotionsRequest, resolve_one, run_of_motions
 from lcollision_core.tasks.verdicts import ResolvedClip
-from lcollision_core.tasks.words import say
+from lcollision_core.tasks.words import joined, say, say_number
 
 _ONLY_CLIP_RATE = 30.0
 
@@ -220,11 +221,12 @@ def carried_domains(
 
     Bodies match as in `carried_pose`.
     """
-    left: set[int] = set()
+    by_name = {name: domain for domain, name in enumerate(after.domain_names)}
+    place_of = {here: by_name.get(name, -1) for here, name in enumerate(before.domain_names)}
     for old_name, name in _bodies_in_both(before, after, removed):
-        old, new = _own_domains(before, old_name), _own_domains(after, name)
-        left |= {there for here, there in zip(old, new, strict=False) if here in domains}
-    return frozenset(left)
+        own = zip(_own_domains(before, old_name), _own_domains(after, name), strict=True)
+        place_of |= dict(own)
+    return frozenset({place_of[domain] for domain in domains} - {-1})
 
 
 def _bodies_in_both(before: Body, after: Body, removed: str) -> Iterator[tuple[str, str]]:
@@ -246,9 +248,12 @@ def _bodies_in_both(before: Body, after: Body, removed: str) -> Iterator[tuple[s
 
 
 def _own_domains(body: Body, name: str) -> range:
-    """Return the domains of a body in a scene, or of a body alone."""
+    """Return the domains of a body alone, or in a scene, there without those of what it holds."""
     scene = as_scene(body)
-    return range(len(body.domain_names)) if scene is None else scene.domains_of_member(name)
+    if scene is None:
+        return range(len(body.domain_names))
+    member = scene.member(name)
+    return scene.domains_of_member(name)[: len(member.body.domain_names) if member.moves else 1]
 
 
 def with_ground(body: Body, body_file: str) -> str:
@@ -320,9 +325,9 @@ def read_scene_poses(
                 continue
             try:
                 if path.suffix.lower() == POSES_SUFFIX:
-                    poses_of[member.name] = [
-                        _placed(member.body, pose) for pose in read_some_poses(path, member.body)
-                    ]
+                    own = read_some_poses(path, member.body)
+                    _note_placement(member, [pose.placement for pose in own], job)
+                    poses_of[member.name] = [placed_pose(member.body, pose) for pose in own]
                 else:
                     poses_of[member.name] = [_encoded(member, path, scale, job)]
             except (PoseSetError, OtherModelError) as error:
@@ -355,7 +360,18 @@ def read_scene_poses(
     return poses
 
 
-def _placed(body: Body, pose: NamedPose) -> NamedPose:
+def _note_placement(
+    member: SceneMember, places: Sequence[RigidTransform | None] | None, job: Job
+) -> None:
+    if member.body.joints is None and any(place is not None for place in places or ()):
+        text = say(
+            "{name}: the file's placement is left out, as no code moves this body as a whole",
+            name=member.name,
+        )
+        job.note(text)
+
+
+def placed_pose(body: Body, pose: NamedPose) -> NamedPose:
     """Return a pose whose placement became codes of the whole body."""
     if pose.placement is None:
         return pose
@@ -394,7 +410,7 @@ class PlayedMotion:
 
     @property
     def is_own_clip(self) -> bool:
-        """Whether it is a clip of a character's own file, which is written with it changed."""
+        """Whether it is a clip of a character's own file, which is rewritten with it corrected."""
         body, file = self.member.body, self.file
         return file is not None and bends(body) and body.is_of_file(file)
 
@@ -439,6 +455,7 @@ def scene_motion(
             continue
         file, clip, seconds = asked_clips[member.name]
         motion = read_motions(member.body, file, clip, rate, job.part())[0]
+        _note_placement(member, motion.placements, job)
         motion = _moved_by_codes(member.body, motion).at_rate(rate)
         motions.append(PlayedMotion(member, motion, file, round(seconds * rate)))
     moving = [(of_body, of_body.motion) for of_body in motions if of_body.motion is not None]
@@ -470,10 +487,15 @@ def _placed_codes(
     if joints is None:
         return codes
     rows = zip(places, map(joints.transforms, codes), strict=True)
-    placed = [moves if place is None else place.matrix @ moves for place, moves in rows]
+    placed = [moves if place is None else _unscaled(place).matrix @ moves for place, moves in rows]
     result = joints.unwound(joints.codes_of_transforms(np.array(placed)))
     result[:, body.shape_codes] = codes[:, body.shape_codes]
     return result
+
+
+def _unscaled(place: RigidTransform) -> RigidTransform:
+    """Return a placement in the unit of the body that it places."""
+    return replace(place, translation=place.translation / place.scale, scale=1.0)
 
 
 def _space_at(
@@ -559,16 +581,21 @@ def write_member_motions(
     after: Motion,
     played: Sequence[PlayedMotion],
     job: Job = UNWATCHED,
-) -> None:
+) -> dict[str, Path]:
     """Write a motion of a scene, each body to its own file of a folder.
 
     A body that plays its own clip gets its file with the changed clip; for other characters the
     motion is a new clip. Props get point caches, including held ones, which move with their holder.
 
+    Returns
+    -------
+    files : that were written, by the name of the body
+
     Raises
     ------
     LCollisionError : a file cannot be written.
     """
+    files: dict[str, Path] = {}
     folder.mkdir(parents=True, exist_ok=True)
     check, n = body.exact_check(), len(after)
     by_name = {member_motion.member.name: member_motion for member_motion in played}
@@ -590,23 +617,24 @@ def write_member_motions(
                 name = before.name if motion is None else motion.name
                 write_new_clips(path, member.body, [Motion(name, after.times, new)])
             else:
-                motion = _lasting(motion, n - first)
+                motion = _lasting(motion, n - first, after.rate)
                 changed = replace(motion, codes=np.array(new[first:]))
                 spans = runs((motion.codes != changed.codes).any(axis=1))
                 change = MotionChange(motion, changed, spans)
                 written = write_clips(path, member.body, own_file, [change])
                 for sentence in written.notes:
                     job.note(f"{member.name}: {sentence}")
-        job.note(say("wrote {name} to {path}", name=member.name, path=path))
+        files[member.name] = path
+    return files
 
 
-def _lasting(motion: Motion, n: int) -> Motion:
-    """Return a motion that stays in its last frame until it has n frames."""
+def _lasting(motion: Motion, n: int, rate: float) -> Motion:
+    """Return a motion that stays in its last frame until it has n frames, at a rate."""
     last, space_at, hidden = len(motion) - 1, motion.space_at, motion.hidden
     if n == last + 1:
         return motion
     frames = np.minimum(np.arange(n), last)
-    after = motion.times[-1] + np.arange(1, n - last) / motion.rate
+    after = motion.times[-1] + np.arange(1, n - last) / rate
     return replace(
         motion,
         times=np.concatenate([motion.times, after]),
@@ -678,10 +706,19 @@ def export_scene_motion(
     ----------
     before : the motion as read from the bodies' clips
     """
-    played = scene_motion(body, (), MotionChoice(), job)[1]
-    after = _as_played(body, after, played, job)
-    write_member_motions(folder, body, before, after, played, job)
-    return say("Exported each body to {folder}", folder=folder.name)
+    notes: list[str] = []
+    noting = Job(job.report, job, note=notes.append)
+    played = scene_motion(body, (), MotionChoice(), noting)[1]
+    as_played = _as_played(body, after, played, noting)
+    n_colliding = 0
+    if as_played is not after:
+        n_colliding = int((~as_played.are_free(body.exact_check())).sum())
+    write_member_motions(folder, body, before, as_played, played, noting)
+    exported = say("Exported each body to {folder}", folder=folder.name)
+    if n_colliding:
+        text = say_number(n_colliding, "{n} frame collides", "{n} frames collide")
+        notes.append(text)
+    return joined([exported, *notes])
 
 
 def resolve_scene_motion(
@@ -718,8 +755,11 @@ def resolve_scene_motion(
         if output.form == "folder":
             after = _as_played(body, change.after, of_bodies, job)
             if after is not change.after:
-                count_stuck(row, body, ~after.are_free(body.exact_check()))
-            write_member_motions(output.path, body, motion, after, of_bodies, job)
+                is_free = after.are_free(body.exact_check())
+                count_stuck(row, body, ~is_free, reason=Reason.CLIP_STARTS_LATER)
+            written = write_member_motions(output.path, body, motion, after, of_bodies, job)
+            for name, path in written.items():
+                job.note(say("wrote {name} to {path}", name=name, path=path))
         else:
             write_motions(output, body, Path(), [change], [row], job)
     return row

@@ -237,7 +237,7 @@ def wait_for_exports(
     title: str = "Closing",
     note: str = "The editor closes once that is done.",
 ) -> bool:
-    """Wait for pending exports, as while the window closes, in a dialog with a Cancel button.
+    """Wait for pending exports in a dialog with a Cancel button, for example as the window closes.
 
     Returns
     -------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,11 @@ import pytest
 
 from lcollision_core.bodies import open_body
 from lcollision_core.bodies.motions import read_motions
+from lcollision_core.bodies.scene_file import body_of_scene
+from lcollision_core.jobs import Job
+from lcollision_core.options import MotionChoice, SceneOptions
 from lcollision_core.tasks.opening import open_any
+from lcollision_core.tasks.scenes import export_scene_motion, playing, scene_motion, scene_of
 from tests.app.support import Lcollision, refusal
 from tests.rigged_shapes import rigged_body, write_gltf
 from tests.skeletons import PERSON, character_from
@@ -131,7 +136,7 @@ def test_a_motion_without_its_body_is_refused_in_a_scene(
     scene = ("--with", hero, "--at", "hero 2=3,0,0")
     refused = refusal(lcollision, "resolve", hero, walk, *scene, "-o", f"{out}/")
     assert refused.endswith(
-        f"walk.bvh is no body of the scene; say who moves by it: --play 'hero={walk}'"
+        f"walk.bvh is a motion, not a body of the scene; assign it with --play 'hero={walk}'"
     )
     # Unity names motions like this.
     play = ("--play", f"hero={walk.rename(tmp_path / 'hero@walk.bvh')}")
@@ -155,7 +160,29 @@ def test_what_moves_before_a_clip_starts_is_reported_as_it_is_played(
     again = ("--clips", "--json", out / "hero.glb", "--with", out / "hero 2.glb", *place)
     (played,) = json.loads(lcollision("check", *again).stdout)
     assert [frame["frame"] for frame in played["colliding_frames"]] == row["colliding_frames"]
-    assert "hero 2: until its clip starts, it stays in the first frame" in resolved.stderr
+    note = "hero 2: until its clip starts, it stays in the first frame"
+    assert note in resolved.stderr
+    reasons = {span["reason"] for span in row["kept_spans"]}
+    assert "the clip of a body that should move starts later" in reasons
+
+
+def test_an_export_says_what_moves_before_a_clip_starts(hero: Path, tmp_path: Path) -> None:
+    options = SceneOptions(others=(str(hero),), places=("hero 2=2,0,0",))
+    clip = open_body(hero).own_clips[0]
+    body = body_of_scene(playing(scene_of(str(hero), options), 1, clip, 0.15))
+    before, _ = scene_motion(body, (), MotionChoice())
+    codes = before.codes.copy()
+    own = body.space.codes[1]
+    # Into the other hero, until its clip starts.
+    codes[:2, own[0]] -= 1.1
+    assert not replace(before, codes=codes).are_free(body.exact_check())[:2].any()
+    said = export_scene_motion(tmp_path / "out", body, before, replace(before, codes=codes), Job())
+    assert said == (
+        "Exported each body to out; hero 2: until its clip starts, it stays in the first frame"
+    )
+    file = tmp_path / "out" / "hero 2.glb"
+    (written,), (own_clip,) = (read_motions(open_body(path), path) for path in (file, hero))
+    np.testing.assert_allclose(written.codes, own_clip.codes, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,8 @@ from lcollision_core.files.motion.caches import write_point_cache
 from lcollision_core.options import ExportRequest, MotionChoice, ResolveOptions
 from lcollision_core.posing import DragOptions, Grip
 from lcollision_core.tasks.exporting import write_members
-from lcollision_core.tasks.opening import open_any
-from lcollision_core.tasks.scenes import read_scene_poses, scene_motion
+from lcollision_core.tasks.opening import open_any, pose_of_member
+from lcollision_core.tasks.scenes import carried_domains, read_scene_poses, scene_motion
 from tests.core.gltf_builder import GltfBuilder, rotation
 from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import FloatArray, rigged_body, write_gltf
@@ -295,8 +295,30 @@ def test_a_point_cache_moves_a_whole_body_of_a_scene(folder: Path, tmp_path: Pat
     write_poses(poses, hero, [NamedPose("a", pose.latent, pose.placement)])
     (given,) = read_scene_poses(body, [poses], 1.0)
     assert np.allclose(body.decode(given.pose.latent)[rows], frames[3], atol=1e-5)
+    # As the window reads it; in centimetres, it stands at the same place.
+    of_member = pose_of_member(body, poses)
+    assert of_member is not None
+    assert of_member.members == ("hero",)
+    np.testing.assert_array_equal(of_member.pose.latent, given.pose.latent)
+    in_centimetres = hero.encode(100.0 * frames[3], scale=0.01)
+    write_poses(poses, hero, [NamedPose("a", in_centimetres.latent, in_centimetres.placement)])
+    (given,) = read_scene_poses(body, [poses], 1.0)
+    assert np.allclose(body.decode(given.pose.latent)[rows], frames[3], atol=1e-4)
     for number, frame in enumerate(frames):
         assert np.allclose(motion.vertices(number, check)[rows], frame, atol=1e-5)
+
+
+def test_locks_stay_with_what_a_body_holds(folder: Path, tmp_path: Path) -> None:
+    hero = ScenePart(str(folder / "hero.glb"))
+    held = []
+    for name in ("cup", "stick"):
+        write_mesh(tmp_path / f"{name}.obj", (_BOX - 0.5) * 0.1, _BOX_FACES)
+        held.append(ScenePart(str(tmp_path / f"{name}.obj"), held_by="hero", joint="lefthand"))
+    both, stick = (body_of_scene(SceneFile((hero, *parts))) for parts in (held, held[1:]))
+    cup_domain, stick_domain = map(both.domain_names.index, ("cup", "stick"))
+    left = carried_domains({cup_domain, stick_domain, 2}, both, stick, "cup")
+    assert left == {stick.domain_names.index("stick"), 2}
+    assert carried_domains({cup_domain}, both, stick, "cup") == frozenset()
 
 
 def test_a_prop_elsewhere_comes_to_the_joint_that_holds_it(tmp_path: Path, folder: Path) -> None:
