@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from lcollision_core.acap.codec import BLOCK_POSES
 from lcollision_core.bodies.card import ModelCard
+from lcollision_core.bodies.latent_space import SHAPES, WHOLE_BODY, LatentGroup, LatentSpace
 from lcollision_core.bodies.mirror import (
     MirroredPose,
     MirrorSource,
@@ -25,15 +26,7 @@ from lcollision_core.bodies.mirror import (
     find_symmetry,
     sorted_faces,
 )
-from lcollision_core.bodies.names import (
-    SHAPES,
-    WHOLE_BODY,
-    CodeEffect,
-    LatentGroup,
-    LatentSpace,
-    code_names,
-    with_regions,
-)
+from lcollision_core.bodies.names import CodeEffect, code_names, with_regions
 from lcollision_core.errors import LCollisionError, ModelFileError, PoseSetError, ShapeError
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.meshes import (

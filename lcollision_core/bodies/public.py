@@ -18,6 +18,7 @@ from lcollision_core.bodies.export import (
     write_pose,
     write_sequence,
 )
+from lcollision_core.bodies.latent_space import LatentGroup, LatentSpace
 from lcollision_core.bodies.learned_body import (
     LearnedBody,
     ListedModel,
@@ -32,12 +33,7 @@ from lcollision_core.bodies.learned_body import (
 )
 from lcollision_core.bodies.mesh_body import MeshBody
 from lcollision_core.bodies.mirror import MirroredPose, MirrorSource, Symmetry, fingerprint_of_pose
-from lcollision_core.bodies.names import (
-    MAX_POSE_NAME_LENGTH,
-    LatentGroup,
-    LatentSpace,
-    unique_names,
-)
+from lcollision_core.bodies.names import MAX_POSE_NAME_LENGTH, unique_names
 from lcollision_core.bodies.poses import (
     MAX_PINS,
     MAX_TAGS,

@@ -17,6 +17,7 @@ import scipy
 from lcollision_core.bodies.anatomy import ROLE_NAMES, joint_parts
 from lcollision_core.bodies.body import Body, read_only
 from lcollision_core.bodies.card import ModelCard
+from lcollision_core.bodies.latent_space import WHOLE_BODY, LatentSpace
 from lcollision_core.bodies.mirror import (
     JointSides,
     PoseMirror,
@@ -27,9 +28,7 @@ from lcollision_core.bodies.mirror import (
 from lcollision_core.bodies.names import (
     MAX_NAME_LENGTH,
     MAX_POSE_NAME_LENGTH,
-    WHOLE_BODY,
     CodeEffect,
-    LatentSpace,
     domain_colours,
     unique_names,
     way_in_words,

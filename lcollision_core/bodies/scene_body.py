@@ -15,17 +15,9 @@ from msgspec import Meta
 
 from lcollision_core.bodies.body import Body, read_only
 from lcollision_core.bodies.card import ModelCard
+from lcollision_core.bodies.latent_space import SHAPES, WHOLE_BODY, LatentGroup, LatentSpace
 from lcollision_core.bodies.mirror import PoseMirror, Symmetry
-from lcollision_core.bodies.names import (
-    BETWEEN_BODIES,
-    MAX_NAME_LENGTH,
-    SHAPES,
-    WHOLE_BODY,
-    CodeEffect,
-    LatentGroup,
-    LatentSpace,
-    unique_names,
-)
+from lcollision_core.bodies.names import BETWEEN_BODIES, MAX_NAME_LENGTH, CodeEffect, unique_names
 from lcollision_core.bodies.rig_poses import StarterPose
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.bodies.scene_space import PlacedSpace, SceneSpace, StillSpace

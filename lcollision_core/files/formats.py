@@ -1,7 +1,7 @@
 """The file formats by extension: their content, reader, writer and label.
 
 It is the only such list: to add a format, add an entry to `FILES`, and a module with the functions
-that it names.
+that it names. The motions of skeletons are read in `bodies/retargeting.py`.
 """
 
 from __future__ import annotations
@@ -153,4 +153,4 @@ LEARNED_FROM = suffixes_of(Holds.POINTS | Holds.POSE_SET)
 (SMPL_SUFFIX,) = suffixes_of(Holds.SMPL)
 (POSES_SUFFIX,) = suffixes_of(Holds.POSES)
 (MODEL_SUFFIX,) = suffixes_of(Holds.MODEL)
-BVH_SUFFIX, VRMA_SUFFIX = SKELETON_SUFFIXES
+BVH_SUFFIX, VRMA_SUFFIX = ".bvh", ".vrma"

@@ -1,4 +1,4 @@
-"""Training of a predictor: its configuration, the split of its rows, its files."""
+"""A predictor's architectures, presets and training options; the split of its rows, its files."""
 
 from __future__ import annotations
 

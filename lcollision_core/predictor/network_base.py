@@ -1,4 +1,4 @@
-"""Common parts of the presets' networks: latent codes in, scaled energies and one logit out."""
+"""What the networks of `config.Architecture` share: latent codes in, energies and a logit out."""
 
 from __future__ import annotations
 

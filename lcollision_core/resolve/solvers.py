@@ -1,7 +1,8 @@
 """Solvers of a problem: sequential quadratic programming, and those of NLopt.
 
 With one linearised constraint the quadratic program has nearly a closed form, so an iteration
-costs little more than the model's gradients, which are evaluated in batches.
+costs little more than the model's gradients, which are evaluated in batches. A further solver has
+its name in `options.Solver`; if it is not NLopt's, `resolver.py` calls it.
 """
 
 from __future__ import annotations
