@@ -271,12 +271,7 @@ def _require_storable(full_name: str, name: str, array: npt.NDArray[Any]) -> Non
 
 def digest_of(text: str, tensors: Mapping[str, npt.NDArray[Any]]) -> str:
     """Return the SHA-256 of a text and named arrays, independent of their order."""
-    digest = hashlib.sha256(text.encode())
-    for name in sorted(tensors):
-        array = tensors[name]
-        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        digest.update(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
-    return digest.hexdigest()
+    return _digest(text, tensors, "\n")
 
 
 def run_key(arrays: Mapping[str, npt.NDArray[Any]], options: Mapping[str, Any]) -> str:
@@ -287,9 +282,14 @@ def run_key(arrays: Mapping[str, npt.NDArray[Any]], options: Mapping[str, Any]) 
     arrays : its data, by name
     options : JSON values
     """
-    digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    return _digest(json.dumps(options, sort_keys=True), contiguous, "")
+
+
+def _digest(text: str, arrays: Mapping[str, npt.NDArray[Any]], ending: str) -> str:
+    digest = hashlib.sha256(text.encode())
     for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
-        digest.update(array.tobytes())
+        array = arrays[name]
+        digest.update(f"{name} {array.dtype.str} {array.shape}{ending}".encode())
+        digest.update(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
     return digest.hexdigest()
