@@ -400,9 +400,11 @@ class SceneBody(Body):
 
     def with_codes_of_member(self, name: str, latent: FloatArray, codes: FloatArray) -> FloatArray:
         """Return (D,) codes with those of a moving body replaced by (D_k,) codes."""
-        own = {m.name: self.codes_of_member(m.name, latent) for m in self.standing if m.moves}
-        own[name] = codes
-        return self.joined_codes([own.get(member.name) for member in self.members])
+        replaced = latent.copy()
+        for places, member in zip(self._space.codes, self.standing, strict=True):
+            if member.name == name:
+                replaced[places] = codes
+        return replaced
 
     def domains_of_member(self, name: str) -> range:
         """Return the body parts of a body and what it holds; empty for a held body."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Flag, auto
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 
@@ -154,3 +155,8 @@ LEARNED_FROM = suffixes_of(Holds.POINTS | Holds.POSE_SET)
 (POSES_SUFFIX,) = suffixes_of(Holds.POSES)
 (MODEL_SUFFIX,) = suffixes_of(Holds.MODEL)
 BVH_SUFFIX, VRMA_SUFFIX = ".bvh", ".vrma"
+
+
+def is_model(source: str | Path) -> bool:
+    """Whether a source names a learned model: by its file, or by its name alone."""
+    return Path(source).suffix.lower() in ("", MODEL_SUFFIX)

@@ -274,8 +274,8 @@ class CorrectedFrames:
 
     def faults(self, span: range) -> dict[int, Reason]:
         """Return the frames of a span that are worse than the original; update `is_free`."""
-        fractions = [self.problem.fractions] * self.problem.n
-        return self.problem.guard.faults(span, self.codes, self.is_free, fractions)
+        problem = self.problem
+        return problem.guard.faults(span, self.codes, self.is_free, problem.fractions)
 
     def take(self, span: range, codes: FloatArray) -> dict[int, Reason]:
         """Set the (len(span), D) codes of a span, unless that makes frames worse.

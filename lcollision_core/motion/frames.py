@@ -827,7 +827,7 @@ class Guard:
         span: range,
         codes: FloatArray,
         free: npt.NDArray[np.bool_],
-        fractions: Sequence[FloatArray],
+        fractions: FloatArray,
     ) -> dict[int, Reason]:
         """Return the frames of a span that are worse than the original, and why.
 
@@ -835,7 +835,7 @@ class Guard:
         ----------
         codes : (n, D) corrected
         free : (n,) bool, set for the frames of the span
-        fractions : for each frame, fractions of the way to the next of the poses to check
+        fractions : of the way from a frame to the next, of the poses to check
         """
         frame_numbers = [at % self.n for at in span]
         reasons: dict[int, Reason] = {}
@@ -851,7 +851,7 @@ class Guard:
         pairs = [at % self.n for at in range(span.start - 1, span.stop)]
         pairs = [at for at in pairs if at < last and judged_ways[at]]
         worse = self.frames.pool.map(
-            lambda at: self._is_worse_between(at, codes, fractions[at].tolist()), pairs
+            lambda at: self._is_worse_between(at, codes, fractions.tolist()), pairs
         )
         for at, is_worse in zip(pairs, worse, strict=True):
             if is_worse:

@@ -542,7 +542,7 @@ class _Resolution:
             other.motion.codes[:n],
             other.after[:n].copy(),
         )
-        faults = problem.guard.faults(range(n), codes, is_free, [problem.fractions] * n)
+        faults = problem.guard.faults(range(n), codes, is_free, problem.fractions)
         if not faults:
             spans = tuple(runs((other.motion.codes != problem.motion.codes).any(axis=1)))
             return replace(other, before=problem.before, spans=spans, standing=problem.standing)

@@ -31,7 +31,7 @@ from lcollision_core.compiled import working_seconds
 from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files import Mesh, audit_mesh, read_mesh, read_pose_set
-from lcollision_core.files.formats import ANIMATED_SUFFIXES, MODEL_SUFFIX, SCENE_SUFFIXES
+from lcollision_core.files.formats import ANIMATED_SUFFIXES, SCENE_SUFFIXES, is_model
 from lcollision_core.files.motion.generated import is_generated
 from lcollision_core.files.pose_set_reading import frame_rate
 from lcollision_core.files.safe import write_table
@@ -149,7 +149,7 @@ def _check_scene(path: Path, request: CheckRequest, job: Job) -> CheckedMesh:
     posed: list[npt.NDArray[np.float64]] = []
     for part in scene.bodies:
         file = Path(part.file)
-        if file.suffix.lower() in ("", MODEL_SUFFIX):
+        if is_model(part.file):
             model = open_body(part.file)
             bodies.append(model)
             posed.append(model.reference)

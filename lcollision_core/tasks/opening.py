@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from lcollision_core.errors import MeshFileError, ModelFileError, PoseSetError, WrongScaleError
-from lcollision_core.files.formats import MODEL_SUFFIX, SCENE_SUFFIXES
+from lcollision_core.files.formats import SCENE_SUFFIXES, is_model
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import MotionChoice
 
@@ -28,7 +28,7 @@ def open_any(source: str | Path) -> Body:
     Only the kind of body that it is gets imported.
     """
     suffix = Path(source).suffix.lower()
-    if suffix in ("", MODEL_SUFFIX):
+    if is_model(source):
         from lcollision_core.bodies.learned_body import LearnedBody
 
         return LearnedBody.load(source)
@@ -197,15 +197,13 @@ def pose_of_member(body: Body, path: Path) -> MemberPose | None:
     from lcollision_core.tasks.scenes import placed_pose
 
     scene = as_scene(body)
-    bodies = {} if scene is None else {m.name: m.body for m in scene.standing if m.moves}
-    for own in bodies.values():
+    members = [] if scene is None else [member for member in scene.standing if member.moves]
+    for fingerprint, own in {m.body.fingerprint: m.body for m in members}.items():
         try:
             content = read_pose_file(path, own)
         except OtherModelError:
             continue
-        fitting = tuple(
-            name for name, other in bodies.items() if other.fingerprint == own.fingerprint
-        )
+        fitting = tuple(m.name for m in members if m.body.fingerprint == fingerprint)
         pose = content.working or next(iter(content.all_poses), None)
         return None if pose is None else MemberPose(path, placed_pose(own, pose), fitting)
     return None

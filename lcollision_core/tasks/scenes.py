@@ -472,7 +472,7 @@ def scene_motion(
 
 def _moved_by_codes(body: Body, motion: Motion) -> Motion:
     """Return a motion whose placements, as of a point cache, are codes of the whole body."""
-    if body.joints is None or motion.placements is None:
+    if motion.placements is None:
         return motion
     return replace(
         motion, codes=_placed_codes(body, motion.codes, motion.placements), placements=None
