@@ -213,6 +213,9 @@ def resolve(
         )
     else:
         refuse_given(context, _OF_MOTIONS, "needs --motion", "add that, or leave it out")
+    if for_cloth and options.clearance == 0.0:
+        what = "0 leaves no room for cloth"
+        refuse_given(context, ("clearance",), what, "leave it out for 3 mm, or --for-cloth out")
     may_touch = touch_entries(touch, options.clearance or float(for_cloth))
     choose_device(device, note)
     model = open_scene(model_name, scene)

@@ -44,7 +44,7 @@ class View:
 
 
 def preset_view(
-    name: str, vertices: npt.NDArray[Any], up_axis: int, front: FloatArray, aspect: float
+    name: str, vertices: npt.NDArray[Any], up: npt.ArrayLike, front: FloatArray, aspect: float
 ) -> View:
     """Return a view of a whole mesh from a preset side.
 
@@ -52,15 +52,14 @@ def preset_view(
     ----------
     name : one of `CAMERAS`
     vertices : (V, 3) array
-    up_axis : 0, 1 or 2
-    front : (3,) unit vector, the direction that the body faces
+    up, front : (3,) unit vectors; the direction that the body faces
     aspect : width over height of the image
 
     Raises
     ------
     KeyError : `name` is not a preset.
     """
-    up = np.eye(3)[up_axis]
+    up = np.asarray(up, np.float64)
     left = np.cross(up, front)
     towards = {
         "Three-quarter": 0.86 * front + 0.44 * left + 0.22 * up,

@@ -91,7 +91,7 @@ def _paste_sides(
     normals = vertex_normals(vertices, model.faces)
     scene.show(vertices, normals, mask_colours(model.attention_mask, model.card.domain_colours))
     for index, side in enumerate(("Front", "Back")):
-        scene.view = preset_view(side, vertices, model.up_axis, model.front, width / height)
+        scene.view = preset_view(side, vertices, model.up, model.front, width / height)
         picture.paste(renderer.drawn(), (index * width, 0))
     renderer.close()
 

@@ -20,11 +20,12 @@ from app.view.actors import (
     body_actor,
     make_actor,
 )
-from app.view.camera import VIEW_ANGLE, View
+from app.view.camera import VIEW_ANGLE, FloatArray, View
 from app.view.shading import COLLIDING_FACE, NAMED_FACE, UNCOUNTED_FACE
 
 if TYPE_CHECKING:
     from app.view.shading import Theme
+    from app.work.frames import PoseFrame
     from lcollision_core.bodies import Body
     from lcollision_core.posing import Grip
 
@@ -54,7 +55,7 @@ class Scene:
     def __init__(self, plotter: pv.BasePlotter, model: Body, theme: Theme) -> None:
         self._renderer = plotter.renderer
         self._renderer.RemoveAllViewProps()
-        self._faces, self._up_axis = model.faces, model.up_axis
+        self._faces, self._up = model.faces, np.array(model.up)
         self.surface = Surface(model.faces, model.n_vertices)
         self.body = body_actor(self.surface.polydata)
         self.body.SetPickable(True)
@@ -74,11 +75,10 @@ class Scene:
         self.selection = FaceHighlight(self.surface, model.faces, NAMED_FACE, 3)
         self._highlights = (self.uncounted, self.crossing, self.selection)
 
-        up = np.array(model.up)
         # Several bodies stand beside each other: their floor is as wide as they are.
         extents = np.ptp(model.without_ground(model.reference), axis=0)
         radius = _FLOOR_RADIUS * max(model.body_size, *np.delete(extents, model.up_axis))
-        disc = pv.Disc(inner=0.0, outer=radius, normal=up, c_res=96)
+        disc = pv.Disc(inner=0.0, outer=radius, normal=self._up, c_res=96)
         self._floor = make_actor(disc, lighting=False, culling="back")
         self._shadow = make_actor(self.surface.polydata, lighting=False)
         self._lift = 2e-3 * model.body_size
@@ -95,7 +95,7 @@ class Scene:
         self._patch = Patch(model.space)
         self._patch.lie_on(self.surface.polydata)
         self._patch.paint_on(self.body)
-        self.marks = Marks(self._renderer, model.body_size, up)
+        self.marks = Marks(self._renderer, model.body_size, self._up)
         self.motion = MotionMarks(self._renderer, model, theme)
         self.set_theme(theme)
 
@@ -178,6 +178,17 @@ class Scene:
         self._textured.set_visible(textured)
         self.body.SetVisibility(not textured)
 
+    def show_contacts(self, frame: PoseFrame) -> None:
+        """Ring the points of a frame where contact stops it and where it stands, unless hidden."""
+        self.marks.show_contacts(self._drawn(frame.contacts, frame.vertices))
+        self.marks.show_standing(self._drawn(frame.standing, frame.vertices))
+
+    def _drawn(self, points: FloatArray, vertices: npt.NDArray[np.float32]) -> FloatArray:
+        if self._hidden is None:
+            return points
+        nearest = [int(np.linalg.norm(vertices - point, axis=1).argmin()) for point in points]
+        return points[np.isin(nearest, self._faces[~self._hidden])]
+
     @property
     def is_textured(self) -> bool:
         """Whether the body is drawn textured."""
@@ -237,7 +248,7 @@ class Scene:
         self._patch.fit(device_pixel_ratio)
         self.marks.fit(self.view, device_pixel_ratio)
         # Hide the shadow from below, where the floor is culled too.
-        is_above = self.view.position[self._up_axis] > self._floor.position[self._up_axis]
+        is_above = (self.view.position - self._floor.position) @ self._up > 0.0
         self._shadow.SetVisibility(bool(is_above and self._floor.GetVisibility()))
 
     def copy_from(self, other: Scene) -> None:
@@ -288,15 +299,15 @@ class Scene:
 
     def _lay_floor(self) -> None:
         low, high = self.surface.vertices.min(axis=0), self.surface.vertices.max(axis=0)
-        level, centre = float(low[self._up_axis]), 0.5 * (low + high)
+        up, centre = self._up, 0.5 * (low + high)
+        level = min(float(low @ up), float(high @ up))
         if self._sinks:
             self._ground = level if self._ground is None else min(level, self._ground)
         level = level if self._ground is None else self._ground
-        centre[self._up_axis] = level - self._lift
-        self._floor.position = centre
+        self._floor.position = centre + (level - self._lift - centre @ up) * up
         flat = np.eye(4)
-        flat[self._up_axis, self._up_axis] = 0.0
-        flat[self._up_axis, 3] = level - 0.5 * self._lift
+        flat[:3, :3] -= np.outer(up, up)
+        flat[:3, 3] = (level - 0.5 * self._lift) * up
         self._shadow.user_matrix = flat
 
 

@@ -514,7 +514,7 @@ class Viewport(QWidget):
         if self.scene is not None:
             model = self._document.model
             is_moving = self._document.timeline.motion is not None
-            level = float(model.reference[model.topology.used_vertices, model.up_axis].min())
+            level = float((model.reference[model.topology.used_vertices] @ model.up).min())
             has_place = not model.is_trained
             self.scene.set_ground(
                 level if has_place and not is_moving else None, sinks=has_place and is_moving
@@ -580,8 +580,7 @@ class Viewport(QWidget):
                 scene.uncounted.show(None if exact is None else exact.excluded_pairs)
         if self.mouse is not None:
             self.mouse.mark(frame.vertices)
-        scene.marks.show_contacts(frame.contacts)
-        scene.marks.show_standing(frame.standing)
+        scene.show_contacts(frame)
         scene.fit_to_screen(self.devicePixelRatioF())
 
     def _put(self, scene: Scene, frame: PoseFrame) -> None:
@@ -665,7 +664,7 @@ class Viewport(QWidget):
     def _preset(self, name: str, vertices: npt.NDArray[Any]) -> View:
         model = self._document.model
         vertices = model.without_ground(vertices)
-        return preset_view(name, vertices, model.up_axis, model.front, self._aspect)
+        return preset_view(name, vertices, model.up, model.front, self._aspect)
 
     @property
     def _aspect(self) -> float:

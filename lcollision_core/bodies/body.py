@@ -509,7 +509,7 @@ class Body(ABC):
         """Return a dragger for poses of `exact_check`; use it from one thread at a time."""
         from lcollision_core.posing import PoseDragger
 
-        return PoseDragger(self.exact_check(placement, space), np.eye(3)[self.up_axis])
+        return PoseDragger(self.exact_check(placement, space), np.array(self.up))
 
     def resolve(
         self,

@@ -95,7 +95,7 @@ def export_frame(
         up, front = _Z, _X
     elif preset is ExportAxes.BLENDER and suffix != ".obj":
         up, front = _Z, -_Y
-    own_up, own_front = _AXES[model.up_axis], model.front
+    own_up, own_front = np.array(model.up), model.front
     model_axes = np.stack([own_up, own_front, np.cross(own_up, own_front)])
     turn = np.stack([up, front, np.cross(up, front)]).T @ model_axes
     # Adding 0 turns -0 into 0.
@@ -130,7 +130,7 @@ def export_mesh(
     """
     written = vertices if frame is None else frame.apply(vertices)
     written = as_stored(path, written, model.topology)
-    up = np.eye(3)[model.up_axis] if placement is None else None
+    up = np.array(model.up) if placement is None else None
     is_obj = Path(path).suffix.lower() == ".obj"
     detail = _detail(model, written) if is_obj else None
     write_mesh(path, written, model.faces, up=up, detail=detail)

@@ -628,6 +628,12 @@ class RigBody(Body):
     def _fit(self, vertices: FloatArray, job: Job, *, in_place: bool) -> LatentFit:
         return fit_rig(self.space, vertices, job, in_place=in_place)
 
+    @property
+    def up(self) -> tuple[float, float, float]:
+        """Unit vector along the up axis, which points down it if the file says so."""
+        x, y, z = self.space.up.tolist()
+        return x, y, z
+
     @cached_property
     def front(self) -> FloatArray:
         """(3,) unit vector along an axis: the direction that the character faces."""

@@ -447,6 +447,11 @@ class SceneBody(Body):
         arrays: dict[str, npt.NDArray[Any]] = {}
         return digest_of("scene " + "; ".join(members), arrays)[:16]
 
+    @property
+    def up(self) -> tuple[float, float, float]:
+        """Unit vector along the up axis of the first body."""
+        return self.members[0].body.up
+
     @cached_property
     def front(self) -> FloatArray:
         """(3,) unit vector along an axis: the direction that the first body faces."""
@@ -628,7 +633,7 @@ class SceneBody(Body):
 
         They move along the line on which they stand, sideways, forward or up.
         """
-        up = np.eye(3)[self.up_axis]
+        up = np.array(self.up)
         decoded = self._space.decode(latent[None])[0]
         meshes = [decoded[own] for own in self._space.vertices]
         movable = self._movable

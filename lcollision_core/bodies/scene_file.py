@@ -201,7 +201,7 @@ def beside(scene: SceneFile, file: Path) -> SceneFile:
 def _place(part: ScenePart, body: Body, first: Body) -> RigidTransform:
     """Return the transform from a body's coordinates to the scene's."""
     turn = np.eye(3)
-    if body.up_axis != first.up_axis:
+    if body.up != first.up:
         turn = scipy.spatial.transform.Rotation.align_vectors(
             [np.array(first.up)], [np.array(body.up)]
         )[0].as_matrix()

@@ -71,7 +71,7 @@ def resolve_frames(
     def keep(frame: int, solution: Solved) -> None:
         solved[frame] = solution[1]
 
-    up = np.eye(3)[body.up_axis]
+    up = np.array(body.up)
     resolution = resolve_motion(
         body.resolver, motion, up, options, None, job, within=within, keep=keep, stop=stop
     )
@@ -102,7 +102,7 @@ def free_neighbours(
     # No easing: leave the neighbouring frames alone.
     of_frame = ResolveOptions(clearance=clearance)
     options = MotionOptions(easing=0, keep_feet=False, keep_contacts=False, frame=of_frame)
-    eased, up = edited, np.eye(3)[body.up_axis]
+    eased, up = edited, np.array(body.up)
     for within in runs(is_new):
         eased = resolve_motion(body.resolver, eased, up, options, None, job, within=within).motion
     return None if eased is edited else eased

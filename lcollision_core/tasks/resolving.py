@@ -473,7 +473,7 @@ def resolve_one(
             source=motion.source,
         )
         job.note(no_skin)
-    up = np.eye(3)[body.up_axis]
+    up = np.array(body.up)
     resolution = resolve_motion(
         body.resolver,
         motion,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -357,7 +358,25 @@ def read_scene_poses(
         pose = NamedPose(name, body.joined_codes(codes))
         source = " + ".join(sources) or body.name
         poses.append(InputPose(f"{source}: {name}" if n_poses > 1 else source, pose))
+    _note_copies(body, np.array([given.pose.latent for given in poses]), job)
     return poses
+
+
+def _note_copies(body: SceneBody, codes: FloatArray, job: Job) -> None:
+    """Note moving bodies that are in one place in any of (N, D) poses, as no check finds them."""
+    for first, second in combinations([own for own in body.standing if own.moves], 2):
+        is_same = first.body.fingerprint == second.body.fingerprint
+        if not is_same or not np.array_equal(first.place.matrix, second.place.matrix):
+            continue
+        own, other = (body.codes_of_member(member.name, codes) for member in (first, second))
+        if (own == other).all(axis=1).any():
+            text = say(
+                "{name}: it stands exactly where {other} does, and faces that coincide do not "
+                "collide; move it with --at",
+                name=second.name,
+                other=first.name,
+            )
+            job.note(text)
 
 
 def _note_placement(
@@ -464,6 +483,7 @@ def scene_motion(
     still = [None] * n
     rows = zip(*(codes_of.get(member.name, still) for member in body.members), strict=True)
     codes = np.array([body.joined_codes(row) for row in rows])
+    _note_copies(body, codes, job)
     names = " + ".join(dict.fromkeys(motion.name for _, motion in moving))
     files = dict.fromkeys(of_body.file.name for of_body, _ in moving if of_body.file is not None)
     space_at = _space_at(body, moving)

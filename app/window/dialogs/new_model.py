@@ -586,7 +586,7 @@ class BodyPicture(QLabel):
         """Show (V, 3) vertices with an axis up; y-up files face +z, others -y."""
         self.has_body = True
         front = np.array([0.0, 0.0, 1.0] if up_axis == 1 else [0.0, -1.0, 0.0])
-        view = preset_view("Three-quarter", vertices, up_axis, front, 1.0)
+        view = preset_view("Three-quarter", vertices, np.eye(3)[up_axis], front, 1.0)
         self.setPixmap(
             thumbnail_pixmap(vertices, faces, view, _PREVIEW_WIDTH, self.devicePixelRatioF())
         )

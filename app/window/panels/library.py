@@ -523,7 +523,7 @@ class LibraryPanel(QWidget):
             # For a hand pose, show one hand, large enough to be seen.
             faces = faces[(model.attention_mask[parts[0]] > 0.5)[faces].all(axis=1)]
             posed_vertices = vertices[np.unique(faces)]
-        view = preset_view("Three-quarter", posed_vertices, model.up_axis, model.front, 1.0)
+        view = preset_view("Three-quarter", posed_vertices, model.up, model.front, 1.0)
         drawn = thumbnail_pixmap(vertices, faces, view, THUMBNAIL, device_pixel_ratio)
         picture = QIcon()
         for mode in (QIcon.Mode.Normal, QIcon.Mode.Selected):

@@ -87,6 +87,12 @@ def test_what_is_missing_is_said(
     lcollision: Lcollision, through: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = ("--motion", "--for-cloth", "-o", tmp_path / "out/")
+    none = lcollision("resolve", through, *out, "--clearance", 0)
+    assert none.exit_code == 2
+    assert none.stderr == (
+        "lcollision: --clearance 0 leaves no room for cloth; leave it out for 3 mm, or --for-cloth "
+        "out\n"
+    )
     unknown = lcollision("resolve", "body", through, *out)
     assert unknown.exit_code == 2
     assert "has no known unit, so 3 mm cannot be converted; give" in unknown.stderr

@@ -109,6 +109,21 @@ def test_clips_play_together_from_when_they_are_said_to(
         assert np.isfinite(motion.codes).all()
 
 
+def test_copies_in_the_same_place_are_named(
+    lcollision: Lcollision, hero: Path, tmp_path: Path
+) -> None:
+    same = (
+        "hero 2: it stands exactly where hero does, and faces that coincide do not collide; move "
+        "it with --at"
+    )
+    scene = (hero, "--with", hero)
+    checked = lcollision("check", "--clips", *scene)
+    assert same in checked.stderr
+    assert same in lcollision("resolve", *scene, "-o", f"{tmp_path}/out/").stderr
+    later = lcollision("check", "--clips", *scene, "--at", "hero 2=0.9,0.02,0,180")
+    assert "stands exactly" not in later.stderr
+
+
 def test_a_written_scene_plays_as_it_was_reported_when_one_clip_ends_first(
     lcollision: Lcollision, hero: Path, tmp_path: Path
 ) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,19 +20,23 @@ def renderer() -> PoseRenderer:
     return PoseRenderer(RigBody.of(rigged_tube()), 40, 40, LIGHT)
 
 
-def test_the_ground_does_not_move_with_the_body(renderer: PoseRenderer) -> None:
-    scene, model = renderer.scene, RigBody.of(rigged_tube())
-    up, rest = model.up_axis, model.reference.astype(np.float32)
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["up", "upside down"])
+def test_the_ground_does_not_move_with_the_body(sign: float) -> None:
+    character = rigged_tube()
+    model = RigBody.of(replace(character, up=sign * character.up))
+    scene = PoseRenderer(model, 40, 40, LIGHT).scene
+    up, rest = np.array(model.up), model.reference.astype(np.float32)
+    lowest = float((rest @ up).min())
 
     def level_below(raised: float) -> float:
-        vertices = rest + raised * np.eye(3, dtype=np.float32)[up]
+        vertices = rest + raised * up.astype(np.float32)
         scene.show(vertices, vertex_normals(vertices, model.faces))
-        return scene._floor.position[up] + scene._lift - float(rest[:, up].min())
+        return float(np.array(scene._floor.position) @ up) + scene._lift - lowest
 
     assert [level_below(raised) for raised in (0.0, 0.2, -0.2)] == pytest.approx(
         [0.0, 0.2, -0.2], abs=1e-6
     )
-    scene.set_ground(float(rest[:, up].min()))
+    scene.set_ground(lowest)
     assert [level_below(raised) for raised in (0.0, 0.2, -0.2)] == pytest.approx(
         [0.0] * 3, abs=1e-6
     )

@@ -65,7 +65,7 @@ def test_pins_and_contacts_have_one_size_near_and_far_and_are_drawn_through_the_
     # Inside the body, where only marks drawn through it are visible.
     middle = vertices.mean(axis=0, dtype=np.float64)[None]
     nothing = np.zeros((0, 3))
-    front = preset_view("Front", vertices, editor_model.up_axis, editor_model.front, 1.0)
+    front = preset_view("Front", vertices, editor_model.up, editor_model.front, 1.0)
     drawn_sizes = []
     for zoom in (1.0, 0.6):
         arm = front.position - front.focus

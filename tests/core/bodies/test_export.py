@@ -145,7 +145,7 @@ def test_a_placed_mesh_is_turned_like_all_others(body: LearnedBody, tmp_path: Pa
 def test_every_turn_is_a_rotation_by_right_angles(body: LearnedBody, up_axis: int) -> None:
     class Turned:
         def __init__(self) -> None:
-            self.up_axis = up_axis
+            self.up = np.eye(3)[up_axis]
             self.front = -np.eye(3)[(up_axis + 2) % 3]
 
     for axes in ExportAxes:

@@ -25,6 +25,7 @@ from lcollision_core.posing import DragOptions, Grip
 from lcollision_core.tasks.exporting import write_members
 from lcollision_core.tasks.opening import open_any, pose_of_member
 from lcollision_core.tasks.scenes import carried_domains, read_scene_poses, scene_motion
+from tests.core.fbx_builder import arm_fbx
 from tests.core.gltf_builder import GltfBuilder, rotation
 from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import FloatArray, rigged_body, write_gltf
@@ -65,6 +66,26 @@ def test_codes_are_those_of_the_bodies_and_move_their_vertices_alone(two: SceneB
     assert np.allclose(decoded[two.vertices_of["hero"]], hero.decode(codes[0]))
     villain = hero.decode(codes[1]) * [-1.0, 1.0, -1.0] + [0.5, 0.02, 0.0]
     assert np.allclose(decoded[two.vertices_of["villain"]], villain)
+
+
+def test_a_body_whose_file_says_that_up_is_down_stands_upright(
+    folder: Path, tmp_path: Path
+) -> None:
+    upright = arm_fbx(tmp_path / "arm.fbx")
+    sign = '"UpAxisSign", "int", "Integer", "",'
+    down = tmp_path / "down.fbx"
+    down.write_text(upright.read_text().replace(f"{sign}1", f"{sign}-1"))
+    parts = [ScenePart(str(file)) for file in (folder / "hero.glb", upright, down)]
+    body = body_of_scene(SceneFile(tuple(parts)))
+    arm, turned = (body.reference[body.vertices_of[name]] for name in ("arm", "down"))
+    np.testing.assert_allclose(turned[:, 1], -arm[:, 1], atol=1e-6)
+    stood = body_of_scene(SceneFile((parts[2], parts[0]), "rest"))
+    assert stood.up == (0.0, -1.0, 0.0)
+    bodies = [stood.reference[stood.vertices_of[name]] @ stood.up for name in ("down", "hero")]
+    assert bodies[1].max() > 1.0
+    assert stood.ground is not None
+    lowest = min(float(heights.min()) for heights in bodies)
+    assert stood.ground[0] * stood.body_size == pytest.approx(lowest, abs=1e-2)
 
 
 def test_a_learned_body_is_posed_by_its_codes(folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,13 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
     window.viewport.tint_faces(faces)
     second.setCheckState(1, Qt.CheckState.Unchecked)
     assert selection.n_faces == len(faces) // 2
+    # So are the rings where its contact stops a drag.
+    frame = document.motion.frame
+    assert frame is not None
+    touching = frame.vertices[[0, -1]].astype(np.float64)
+    window.viewport.scene.show_contacts(replace(frame, contacts=touching, standing=touching))
+    for rings in (window.viewport.scene.marks._contacts, window.viewport.scene.marks._standing):
+        np.testing.assert_array_equal(rings, touching[:1])
     second.setCheckState(1, Qt.CheckState.Checked)
     assert selection.n_faces == len(faces)
     window.viewport.tint_faces(None)
