@@ -435,7 +435,7 @@ class SourceFile:
         """
         clip = self._new_clip(path, "poses", request.fps, np.stack(latents), vertices)
         made, stored = self._written, list[npt.NDArray[Any]]()
-        _, notes = write_character_clips(
+        notes = write_character_clips(
             path,
             made.character,
             [clip],
@@ -473,7 +473,7 @@ class SourceFile:
             pose = WrittenPose(self.path, stored[made.to_read], 1.0 / frame.scale)
             free[number].append(not pose.collides(self._body))
 
-        _, notes = write_character_clips(
+        notes = write_character_clips(
             path, made.character, clips, seen, self._body.rules, keep_clips=True
         )
         return [np.array(row, dtype=np.bool_) for row in free], (*made.notes, *notes)

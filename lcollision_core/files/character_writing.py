@@ -227,12 +227,10 @@ class PosedFile:
 
     Attributes
     ----------
-    data : its bytes
     vertices : (V, 3) float64 array, the character's vertices as readers of the file see them
     notes : sentences on what was left out
     """
 
-    data: bytes
     vertices: FloatArray
     notes: tuple[str, ...]
 
@@ -317,7 +315,7 @@ def write_character(
     if clips:
         notes.append(left_out_note("clips left out, as they would hide the pose", clips))
     write_bytes(path, data)
-    return PosedFile(data, stored, (*source.patch.notes, *notes))
+    return PosedFile(stored, (*source.patch.notes, *notes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,7 +346,7 @@ def write_character_clips(
     rules: ContactRules = STRICT,
     *,
     keep_clips: bool = False,
-) -> tuple[bytes, tuple[str, ...]]:
+) -> tuple[str, ...]:
     """Write the character's own file with new clips of its joints before any others.
 
     Parameters
@@ -362,7 +360,6 @@ def write_character_clips(
 
     Returns
     -------
-    data : the bytes of the file
     notes : sentences on what was left out
 
     Raises
@@ -389,7 +386,7 @@ def write_character_clips(
     if left_out:
         notes = (*notes, left_out_note("clips left out", left_out))
     write_bytes(path, data)
-    return data, notes
+    return notes
 
 
 def require_written(path: str | os.PathLike[str], character: Character) -> None:
