@@ -43,9 +43,9 @@ from lcollision_core.files import (
     file_stamp,
     read_pose_set,
 )
-from lcollision_core.files.changed_clips import ChangedClip, FileClips, changed_gltf
+from lcollision_core.files.changed_clips import ChangedClip, changed_gltf
 from lcollision_core.files.character import ClipFrames
-from lcollision_core.files.character_reading import character_of, character_of_smpl
+from lcollision_core.files.character_reading import character_of_gltf, character_of_smpl
 from lcollision_core.files.character_writing import require_written
 from lcollision_core.files.formats import (
     ANIMATED_SUFFIXES,
@@ -666,7 +666,7 @@ def write_clips(
     require_written(path, character)
     written = _ClipsOfFile(as_gltf(character), space, body.exact_check(), file)
     data = written.changed(changes)
-    as_read = FileClips.read(data, file)
+    as_read = character_of_gltf(data, file)
     put_back = [written.worse_spans(change, as_read) for change in changes]
     if any(put_back):
         changes = [
@@ -674,7 +674,7 @@ def write_clips(
             for pair, worse in zip(changes, put_back, strict=True)
         ]
         data = written.changed(changes)
-        as_read = FileClips.read(data, file)
+        as_read = character_of_gltf(data, file)
     free = written.free(changes, as_read)
     write_bytes(path, data)
     return WrittenClips(free, written.made.notes, put_back)
@@ -759,24 +759,24 @@ class _ClipsOfFile:
         )
 
     @cached_property
-    def _unchanged(self) -> FileClips:
-        return FileClips.read(self.changed([]), self.file)
+    def _unchanged(self) -> Character:
+        return character_of_gltf(self.changed([]), self.file)
 
     def _shown(
-        self, motion: Motion, frames: Sequence[int], clips: FileClips
+        self, motion: Motion, frames: Sequence[int], as_read: Character
     ) -> Iterator[npt.NDArray[np.float32]]:
-        """Evaluate frames of a file: (V, 3) vertices in the body's coordinates, as read back."""
-        back = self.made.frame.inverse()
-        for vertices in clips.vertices(motion.name, self._times(motion)[list(frames)]):
-            yield back.apply(vertices[self.made.to_read]).astype(np.float32)
+        """Yield frames of a file as read back: (V, 3) vertices in the body's coordinates."""
+        read_frames = as_read.sample(motion.name, self._times(motion)[list(frames)])
+        for frame in range(len(frames)):
+            yield self._moved_back(read_frames, frame).astype(np.float32)
 
-    def worse_spans(self, change: MotionChange, clips: FileClips) -> list[range]:
+    def worse_spans(self, change: MotionChange, as_read: Character) -> list[range]:
         """Return the spans that are worse in a file than unchanged, by their vertices."""
         motion, most = change.before, change.largest_change
 
         def is_worse_in(frames: range) -> bool:
             checks = {at: motion.seen(self.check, range(at, at + 1)) for at in frames}
-            shown = dict(zip(frames, self._shown(motion, frames, clips), strict=True))
+            shown = dict(zip(frames, self._shown(motion, frames, as_read), strict=True))
             # A free frame is no worse than any other; only the rest are compared.
             left = [
                 at for at in frames if most is not None or not checks[at].is_free_mesh(shown[at])
@@ -802,22 +802,21 @@ class _ClipsOfFile:
             ]
 
     def free(
-        self, changes: Sequence[MotionChange], clips: FileClips
+        self, changes: Sequence[MotionChange], as_read: Character
     ) -> list[npt.NDArray[np.bool_]]:
         """Return which frames of motions are free as read back from a file."""
-        character = character_of(clips.scene, self.file)
         place = self.made.frame.inverse().matrix
         # Parts hidden at rest may have become joints.
         file_rig = self.made.character.rig
         assert file_rig is not None
-        assert character.rig is not None
-        numbers = {node: joint for joint, node in enumerate(character.rig.nodes.tolist())}
+        assert as_read.rig is not None
+        numbers = {node: joint for joint, node in enumerate(as_read.rig.nodes.tolist())}
         nodes = file_rig.nodes[np.argsort(self.made.joints)].tolist()
         joints = [numbers[node] for node in nodes]
         free = []
         for change in changes:
             name, times = change.before.name, self._times(change.before)
-            frames = character.sample(name, times)
+            frames = as_read.sample(name, times)
             assert frames.transforms is not None
             # The rig as read may store influences, or parts hidden at rest, differently.
             vertices_of_frame = {
@@ -829,7 +828,7 @@ class _ClipsOfFile:
                 change.before.times,
                 place @ frames.transforms[:, joints],
                 shown=vertices_of_frame,
-                shapes=self._numbers(character, frames),
+                shapes=self._numbers(as_read, frames),
             )
             free.append(motion.are_free(self.check))
         return free

@@ -1,11 +1,10 @@
-"""Change frames of the clips in a character's glTF file, and evaluate them as readers would."""
+"""Change frames of the clips in a character's glTF file."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,10 +14,9 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.files.character import Character, CharacterFile, Rig
 from lcollision_core.files.gltf.clips import ClipTracks, Track, driven_property
 from lcollision_core.files.gltf.schema import PARTS, GltfDocument, stored_parts
-from lcollision_core.files.scene.joined import JoinedMesh, join_parts
-from lcollision_core.files.scene.scene import Scene, by_node
+from lcollision_core.files.scene.scene import by_node
 from lcollision_core.files.scene.transforms import are_regular, unit_quaternions
-from lcollision_core.files.scene_files import as_file_error, scene_of
+from lcollision_core.files.scene_files import as_file_error
 from lcollision_core.meshes.topology import FloatArray
 
 _UNCHANGED = 1e-9
@@ -89,40 +87,6 @@ def changed_gltf(character: Character, changes: Sequence[ChangedClip]) -> bytes:
         for change in changes:
             _change(file, written, rig, change)
         return written.encoded()
-
-
-@dataclass(frozen=True, eq=False)
-class FileClips:
-    """The clips of a written file, evaluated as readers do.
-
-    Attributes
-    ----------
-    path : of the file, for messages
-    scene : its contents
-    mesh : the joined parts of the scene
-    """
-
-    path: Path
-    scene: Scene
-    mesh: JoinedMesh
-
-    @classmethod
-    def read(cls, data: bytes, path: Path) -> FileClips:
-        """Read the contents of a file.
-
-        Raises
-        ------
-        MeshFileError : the file cannot be read.
-        """
-        with as_file_error(path):
-            scene = scene_of(GltfDocument(data, path))
-            return cls(path, scene, join_parts(scene))
-
-    def vertices(self, clip: str, times: FloatArray) -> FloatArray:
-        """Return the (n, V, 3) vertices of a clip at (n,) times."""
-        scene_clip = next(one for one in self.scene.clips if one.name == clip)
-        with as_file_error(self.path):
-            return self.mesh.posed(scene_clip.sample(times))
 
 
 def _change(file: CharacterFile, patch: GltfDocument, rig: Rig, change: ChangedClip) -> None:

@@ -332,6 +332,18 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
     )
 
 
+def character_of_gltf(data: bytes, path: Path) -> Character:
+    """Make a character from the bytes of a glTF file, which errors call `path`.
+
+    Raises
+    ------
+    MeshFileError : see `read_character`.
+    """
+    with as_file_error(path):
+        scene = scene_of(GltfDocument(data, path))
+    return character_of(scene, path)
+
+
 def _clip_lengths(scene: Scene) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return `Character.clips`, and notes on clips whose key times are damaged."""
     lengths, notes = {}, []

@@ -21,7 +21,7 @@ from vtkmodules.vtkIOGeometry import vtkGLTFReader
 
 from lcollision_core.bodies import open_body
 from lcollision_core.bodies.motions import read_motions
-from lcollision_core.files.changed_clips import FileClips
+from lcollision_core.files.character_reading import character_of_gltf
 from lcollision_core.files.motion.bvh import read_bvh
 from tests.app.blender.running import python_with_bpy
 from tests.app.support import Lcollision
@@ -51,7 +51,7 @@ def proved(path: Path, clip: str) -> FloatArray:
     """Return the (T, P, 3) points of the file's mesh in a clip's frames, as checked free."""
     body = open_body(path)
     (motion,) = read_motions(body, path, clip)
-    frames = list(FileClips.read(path.read_bytes(), path).vertices(clip, motion.times))
+    frames = list(character_of_gltf(path.read_bytes(), path).sample(clip, motion.times).vertices)
     check = body.exact_check()
     assert all(check.is_free_mesh(vertices.astype(np.float32)) for vertices in frames)
     return np.array(frames)[:, body.character.joined]  # type: ignore[attr-defined]

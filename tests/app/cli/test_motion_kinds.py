@@ -16,7 +16,7 @@ from lcollision_core.bodies import open_body, read_poses
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.errors import CancelledError
 from lcollision_core.files import write_mesh
-from lcollision_core.files.changed_clips import FileClips
+from lcollision_core.files.character_reading import character_of_gltf
 from lcollision_core.files.gltf.clips import ClipTracks
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.motion.caches import read_point_cache, write_point_cache
@@ -88,7 +88,8 @@ def test_a_clip_of_any_kind_comes_back_free_and_whole(
     for share in (0.0, 0.4):
         times = old.times[outside] + share / 1000.0
         pairs = (
-            FileClips.read(path.read_bytes(), path).vertices(CLIP, times) for path in (source, free)
+            character_of_gltf(path.read_bytes(), path).sample(CLIP, times).vertices
+            for path in (source, free)
         )
         for one, other in zip(*pairs, strict=True):
             assert np.abs(one - other).max() < 1e-5 * before.body_size

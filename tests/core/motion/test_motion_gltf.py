@@ -10,7 +10,8 @@ import pytest
 from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.files import read_character
-from lcollision_core.files.changed_clips import ChangedClip, FileClips, changed_gltf
+from lcollision_core.files.changed_clips import ChangedClip, changed_gltf
+from lcollision_core.files.character_reading import character_of_gltf
 from lcollision_core.files.gltf import schema
 from lcollision_core.files.gltf.clips import driven_property
 from lcollision_core.files.gltf.schema import GltfDocument
@@ -47,7 +48,7 @@ def test_readers_get_the_new_frames_and_elsewhere_the_old_motion(
     body = RigBody.of(read_character(source))
     changed, codes = change(body, spans)
     data = changed_gltf(body.character, [changed])
-    frames = list(FileClips.read(data, source).vertices(CLIP, changed.times))
+    frames = list(character_of_gltf(data, source).sample(CLIP, changed.times).vertices)
     size = body.body_size
     inside = np.concatenate([np.asarray(span) for span in spans])
     for frame in inside:
@@ -58,8 +59,8 @@ def test_readers_get_the_new_frames_and_elsewhere_the_old_motion(
         free[max(span.start - 1, 0) : span.stop] = False
     for share in (0.0, 0.3, 0.8):
         times = changed.times[:-1][free] + share / 30.0
-        old = FileClips.read(source.read_bytes(), source).vertices(CLIP, times)
-        new = FileClips.read(data, source).vertices(CLIP, times)
+        old = character_of_gltf(source.read_bytes(), source).sample(CLIP, times).vertices
+        new = character_of_gltf(data, source).sample(CLIP, times).vertices
         for one, other in zip(old, new, strict=True):
             assert np.abs(one - other).max() < 1e-5 * size
 
@@ -97,7 +98,7 @@ def test_rotations_of_any_length_are_read_back_as_they_were_read(tmp_path: Path)
     body = RigBody.of(read_character(source))
     changed, codes = change(body, [SPAN])
     data = changed_gltf(body.character, [changed])
-    frames = list(FileClips.read(data, source).vertices(CLIP, changed.times))
+    frames = list(character_of_gltf(data, source).sample(CLIP, changed.times).vertices)
     for frame in SPAN:
         assert np.abs(frames[frame] - body.decode(codes[frame])).max() < 1e-5 * body.body_size
 
@@ -123,7 +124,7 @@ def test_a_joint_that_some_frames_scale_to_nothing_stays_there_and_turns_elsewhe
     for transforms in (changed.before, changed.after):
         transforms[np.ix_([4, 5], np.flatnonzero(below), range(3), range(3))] = 0.0
     data = changed_gltf(body.character, [changed])
-    frames = list(FileClips.read(data, source).vertices(CLIP, changed.times))
+    frames = list(character_of_gltf(data, source).sample(CLIP, changed.times).vertices)
     for frame in set(SPAN) - set(hidden):
         assert np.abs(frames[frame] - body.decode(codes[frame])).max() < 1e-5 * body.body_size
     assert all(np.isfinite(frames[frame]).all() for frame in hidden)
