@@ -643,6 +643,13 @@ def write_motions(
                 job.note(left_out)
 
 
+def measure_again(row: ResolvedClip, body: Body, before: Motion, stored: Motion) -> None:
+    """Let a row say how far a motion was moved that is not stored as it was resolved."""
+    report = MotionReport.of(before, stored, body.exact_check())
+    for name in ("mean_change", "largest_change", "acceleration_ratio", "largest_jump"):
+        setattr(row, name, getattr(report, name))
+
+
 def count_stuck(
     row: ResolvedClip,
     body: Body,
@@ -701,10 +708,7 @@ def _write_clips(
             before, codes = change.before, change.after.codes.copy()
             for span in put_back:
                 codes[span] = before.codes[span]
-            stored = replace(change.after, codes=codes)
-            report = MotionReport.of(before, stored, body.exact_check())
-            for name in ("mean_change", "largest_change", "acceleration_ratio", "largest_jump"):
-                setattr(row, name, getattr(report, name))
+            measure_again(row, body, before, replace(change.after, codes=codes))
         # Rounding reduces the clearance slightly; without one, the check of the file decides.
         if row.clearance == 0.0:
             row.colliding_frames = []

@@ -54,6 +54,7 @@ from lcollision_core.motion.motion import Motion, runs
 from lcollision_core.options import ExportRequest, MotionChoice, SceneOptions
 from lcollision_core.tasks.exporting import (
     count_stuck,
+    measure_again,
     refuse_to_replace,
     source_files,
     write_members,
@@ -594,6 +595,22 @@ def _asked_clips(
     return clip_of_body
 
 
+@dataclass(frozen=True, eq=False)
+class WrittenMotions:
+    """A motion of a scene in files.
+
+    Attributes
+    ----------
+    files : by the name of the body
+    stored : the motion, with the clips of characters as read back
+    put_back : frames in which a clip was left unchanged, as its file can only store a worse result
+    """
+
+    files: dict[str, Path]
+    stored: Motion
+    put_back: list[range]
+
+
 def write_member_motions(
     folder: Path,
     body: SceneBody,
@@ -601,23 +618,20 @@ def write_member_motions(
     after: Motion,
     played: Sequence[PlayedMotion],
     job: Job = UNWATCHED,
-) -> dict[str, Path]:
+) -> WrittenMotions:
     """Write a motion of a scene, each body to its own file of a folder.
 
     A body that plays its own clip gets its file with the changed clip; for other characters the
     motion is a new clip. Props get point caches, including held ones, which move with their holder.
-
-    Returns
-    -------
-    files : that were written, by the name of the body
 
     Raises
     ------
     LCollisionError : a file cannot be written.
     """
     files: dict[str, Path] = {}
+    put_back: list[range] = []
     folder.mkdir(parents=True, exist_ok=True)
-    check, n = body.exact_check(), len(after)
+    check, n, codes = body.exact_check(), len(after), after.codes.copy()
     by_name = {member_motion.member.name: member_motion for member_motion in played}
     for member, file in written_members(body):
         played_motion, path = by_name.get(member.name), folder / file
@@ -627,8 +641,8 @@ def write_member_motions(
             rows, back = body.vertices_of[member.name], member.place.inverse()
             path = path.with_suffix(".pc2")
             meshes = (back.apply(after.vertices(frame, check)[rows]) for frame in range(n))
-            codes = [np.zeros(member.body.latent_size)] * n
-            write_sequence(path, member.body, codes, meshes, ExportRequest(fps=after.rate))
+            unused = [np.zeros(member.body.latent_size)] * n
+            write_sequence(path, member.body, unused, meshes, ExportRequest(fps=after.rate))
         else:
             assert played_motion is not None
             new = body.codes_of_member(member.name, after.codes)
@@ -644,8 +658,13 @@ def write_member_motions(
                 written = write_clips(path, member.body, own_file, [change])
                 for sentence in written.notes:
                     job.note(f"{member.name}: {sentence}")
+                (worse,) = written.put_back
+                put_back += [range(span.start + first, span.stop + first) for span in worse]
+                (stored,) = read_motions(member.body, path, motion.name, after.rate)
+                places = body.space.codes[body.standing.index(member)]
+                codes[:, places] = stored.codes[replace(played_motion, motion=stored).frames(n)]
         files[member.name] = path
-    return files
+    return WrittenMotions(files, replace(after, codes=codes), put_back)
 
 
 def _lasting(motion: Motion, n: int, rate: float) -> Motion:
@@ -730,10 +749,8 @@ def export_scene_motion(
     noting = Job(job.report, job, note=notes.append)
     played = scene_motion(body, (), MotionChoice(), noting)[1]
     as_played = _as_played(body, after, played, noting)
-    n_colliding = 0
-    if as_played is not after:
-        n_colliding = int((~as_played.are_free(body.exact_check())).sum())
-    write_member_motions(folder, body, before, as_played, played, noting)
+    written = write_member_motions(folder, body, before, as_played, played, noting)
+    n_colliding = int((~written.stored.are_free(body.exact_check())).sum())
     exported = say("Exported each body to {folder}", folder=folder.name)
     if n_colliding:
         text = say_number(n_colliding, "{n} frame collides", "{n} frames collide")
@@ -774,11 +791,15 @@ def resolve_scene_motion(
         change, row = resolve_one(request, motion, run, 0, job)
         if output.form == "folder":
             after = _as_played(body, change.after, of_bodies, job)
+            check = body.exact_check()
             if after is not change.after:
-                is_free = after.are_free(body.exact_check())
-                count_stuck(row, body, ~is_free, reason=Reason.CLIP_STARTS_LATER)
+                collides = ~after.are_free(check)
+                count_stuck(row, body, collides, reason=Reason.CLIP_STARTS_LATER)
             written = write_member_motions(output.path, body, motion, after, of_bodies, job)
-            for name, path in written.items():
+            count_stuck(row, body, ~written.stored.are_free(check), written.put_back)
+            if written.put_back:
+                measure_again(row, body, motion, written.stored)
+            for name, path in written.files.items():
                 job.note(say("wrote {name} to {path}", name=name, path=path))
         else:
             write_motions(output, body, Path(), [change], [row], job)

@@ -15,8 +15,15 @@ from lcollision_core.bodies.scene_file import body_of_scene
 from lcollision_core.jobs import Job
 from lcollision_core.options import MotionChoice, SceneOptions
 from lcollision_core.tasks.opening import open_any
-from lcollision_core.tasks.scenes import export_scene_motion, playing, scene_motion, scene_of
+from lcollision_core.tasks.scenes import (
+    export_scene_motion,
+    playing,
+    scene_motion,
+    scene_of,
+    write_member_motions,
+)
 from tests.app.support import Lcollision, refusal
+from tests.core.motion.swings import CLIP, swinging_body
 from tests.rigged_shapes import rigged_body, write_gltf
 from tests.skeletons import PERSON, character_from
 
@@ -272,3 +279,23 @@ def test_scenes_of_a_character_are_free_also_by_vtk(lcollision: Lcollision, tmp_
     assert not any(row["pairs_after"] for row in rows.values())
     # The grip stays in the hand.
     assert [name for name, row in rows.items() if row["foreign_after"]] == ["sword in thigh"]
+
+
+def test_what_the_clip_of_a_body_cannot_hold_is_reported(hero: Path, tmp_path: Path) -> None:
+    swing = write_gltf(swinging_body(), tmp_path / "swing.glb")
+    others = SceneOptions(others=(str(swing),), places=("swing=9,0,0",))
+    body = body_of_scene(playing(scene_of(str(hero), others), 1, CLIP, 1.0))
+    before, played = scene_motion(body, (), MotionChoice())
+    first, places = played[1].start, body.space.codes[1]
+    assert first > 0
+    codes = before.codes.copy()
+    # One span is deeper than before, which the file refuses.
+    deeper = slice(first + 20, first + 28)
+    codes[deeper, places] += 0.2 * (codes[deeper, places] - codes[first, places])
+    after, out = replace(before, codes=codes), tmp_path / "out"
+    written = write_member_motions(out, body, before, after, played)
+    assert written.put_back == [range(first + 20, first + 28)]
+    np.testing.assert_allclose(written.stored.codes, before.codes, atol=1e-6)
+    collides = ~before.are_free(body.exact_check())
+    said = export_scene_motion(out, body, before, after, Job())
+    assert said == f"Exported each body to out; {collides.sum()} frames collide"
