@@ -31,7 +31,12 @@ from lcollision_core.compiled import working_seconds
 from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files import Mesh, audit_mesh, read_mesh, read_pose_set
-from lcollision_core.files.formats import ANIMATED_SUFFIXES, SCENE_SUFFIXES, is_model
+from lcollision_core.files.formats import (
+    ANIMATED_SUFFIXES,
+    POSES_SUFFIX,
+    SCENE_SUFFIXES,
+    is_model,
+)
 from lcollision_core.files.motion.generated import is_generated
 from lcollision_core.files.pose_set_reading import frame_rate
 from lcollision_core.files.safe import write_table
@@ -50,7 +55,7 @@ from lcollision_core.motion import (
 )
 from lcollision_core.options import NO_SCENE, MotionChoice, RuleOptions, SceneOptions
 from lcollision_core.tasks.inputs import body_of_motion
-from lcollision_core.tasks.scenes import parts_text, scene_motion, scene_of
+from lcollision_core.tasks.scenes import parts_text, read_scene_poses, scene_motion, scene_of
 from lcollision_core.tasks.verdicts import CheckedClip, CheckedFrame, CheckedMesh
 from lcollision_core.tasks.words import say, say_number
 
@@ -238,11 +243,20 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
     LCollisionError : the file cannot be read or has no clip, or its body needs no `rest`.
     CancelledError : the job was cancelled.
     """
-    if request.scene.has_others or is_scene_file(path):
-        scene = _as_asked(body_of_scene(scene_of(str(path), request.scene)), request)
+    first_body = request.body or str(path)
+    if request.scene.has_others or is_scene_file(first_body):
+        scene = _as_asked(body_of_scene(scene_of(first_body, request.scene)), request)
         for sentence in scene.notes:
             job.note(sentence)
-        motion, _ = scene_motion(scene, request.scene.played, request.motion, job)
+        played, choice = request.scene.played, request.motion
+        if request.body is not None and path.suffix.lower() == POSES_SUFFIX:
+            codes = [given.pose.latent for given in read_scene_poses(scene, [path], 1.0, job)]
+            times = np.arange(len(codes)) / (choice.fps or NOMINAL_RATE)
+            motion = Motion(path.stem, times, np.array(codes), source=path.name)
+        else:
+            if request.body is not None:
+                played = (*played, f"{scene.members[0].name}={path}")
+            motion, _ = scene_motion(scene, played, choice, job)
         return _check_motions(scene, [motion], path, request, job)
     if request.body is not None:
         body = open_body(request.body)

@@ -93,6 +93,24 @@ def test_each_pose_of_a_body_in_a_scene_is_reported_by_name(
     rows = json.loads(resolved.stdout)
     assert [row["source"] for row in rows] == [f"{poses}: scene {number}" for number in (1, 2)]
     assert sorted(path.name for path in out.iterdir()) == ["scene 1", "scene 2"]
+    # Poses of the scene, or of its first body, are checked like a motion.
+    in_scene = tmp_path / "scene.json"
+    assert lcollision("resolve", hero, poses, *scene, "-o", in_scene).exit_code == 0
+    for file, energies in ((in_scene, [0.0, 0.0]), (poses, [row["energy_before"] for row in rows])):
+        checked = lcollision("check", "--clips", "--json", file, "--body", hero, *scene)
+        (row,) = json.loads(checked.stdout)
+        assert row["frames"] == 2
+        colliding = [frame["frame"] for frame in row["colliding_frames"]]
+        assert colliding == [number for number, energy in enumerate(energies) if energy > 0.0]
+
+
+def test_a_motion_of_the_first_body_is_checked_in_its_scene(
+    lcollision: Lcollision, hero: Path
+) -> None:
+    scene = ["--with", hero, "--at", "hero 2=0.9,0.02,0,180", "--json"]
+    own = lcollision("check", "--clips", hero, *scene)
+    played = lcollision("check", "--clips", hero, "--body", hero, *scene)
+    assert json.loads(played.stdout) == json.loads(own.stdout)
 
 
 @pytest.mark.slow
