@@ -475,7 +475,6 @@ class Mouse(QObject):
     ----------
     document : whose pose is dragged
     canvas : source of the mouse events
-    scene : returns the scene on the canvas
 
     Attributes
     ----------
@@ -500,14 +499,11 @@ class Mouse(QObject):
     camera_moved = Signal(object)
     redraw_wanted = Signal()
 
-    def __init__(
-        self,
-        document: PoseDocument,
-        canvas: Canvas,
-        scene: Callable[[], Scene],
-    ) -> None:
+    _scene: Scene
+
+    def __init__(self, document: PoseDocument, canvas: Canvas) -> None:
         super().__init__(canvas)
-        self._document, self._canvas, self._scene_now = document, canvas, scene
+        self._document, self._canvas = document, canvas
         self.vertex: int | None = None
         self.pin: int | None = None
         self.handle: int | None = None
@@ -532,8 +528,9 @@ class Mouse(QObject):
         document.motion.grip_radius_changed.connect(self._show_patch)
         document.history.pins_changed.connect(self.redraw_wanted)
 
-    def reset(self) -> None:
-        """Forget the pointed vertex and the drag, which belong to the previous model."""
+    def reset(self, scene: Scene) -> None:
+        """Begin with another scene; the pointed vertex and the drag belong to the previous one."""
+        self._scene = scene
         self._forget_drag()
         self.arrows = None
         self._handles = handles_of(self._document.model.space)
@@ -646,10 +643,6 @@ class Mouse(QObject):
         )
 
     @property
-    def _scene(self) -> Scene:
-        return self._scene_now()
-
-    @property
     def _size(self) -> Pixel:
         return float(self._canvas.width()), float(self._canvas.height())
 
@@ -660,7 +653,7 @@ class Mouse(QObject):
         if grip is None and self.vertex is not None and not self._canvas.is_dragging:
             grip = self._document.motion.grip_at(self.vertex)
         # A handle moves its whole body part, so it has no patch.
-        if self._scene.show_grip(grip if self.handle is None else None):
+        if self._scene.patch.show(grip if self.handle is None else None):
             self.redraw_wanted.emit()
 
     @Slot(object)

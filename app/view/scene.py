@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from app.view.shading import Theme
     from app.work.frames import PoseFrame
     from lcollision_core.bodies import Body
-    from lcollision_core.posing import Grip
 
 _GHOST_OPACITY = 0.4
 _GHOST_NEAR, _GHOST_FAR = 0.004, 0.015
@@ -50,6 +49,7 @@ class Scene:
     crossing, uncounted : faces of colliding pairs, and of pairs that do not count
     selection : faces selected in a list
     motion : onion skins and the motion path of a point
+    patch : of a grip, over the colours of the mesh
     """
 
     def __init__(self, plotter: pv.BasePlotter, model: Body, theme: Theme) -> None:
@@ -92,9 +92,9 @@ class Scene:
         ):
             self._renderer.AddActor(actor)
         self.outline = Outline(self._renderer)
-        self._patch = Patch(model.space)
-        self._patch.lie_on(self.surface.polydata)
-        self._patch.paint_on(self.body)
+        self.patch = Patch(model.space)
+        self.patch.lie_on(self.surface.polydata)
+        self.patch.paint_on(self.body)
         self.marks = Marks(self._renderer, model.body_size, self._up)
         self.motion = MotionMarks(self._renderer, model, theme)
         self.set_theme(theme)
@@ -104,7 +104,7 @@ class Scene:
         self._renderer.set_background(theme.sky_bottom, top=theme.sky_top)
         self._floor.prop.color, self._shadow.prop.color = theme.floor, theme.shadow
         self._ghost.colours[:, :3] = pv.Color(theme.ghost).int_rgb
-        self._patch.set_colour(theme.accent)
+        self.patch.set_colour(theme.accent)
         self.motion.set_theme(theme)
 
     def show_floor(self, shown: bool) -> None:
@@ -169,7 +169,7 @@ class Scene:
             hidden = None
             if self._hidden is not None:
                 hidden = _rows_in(look.vertices[look.faces], self._faces[self._hidden])
-            self._textured = TexturedBody(look, self._patch, hidden)
+            self._textured = TexturedBody(look, self.patch, hidden)
             for actor in self._textured.actors:
                 self._renderer.AddActor(actor)
         assert self._textured is not None
@@ -226,15 +226,6 @@ class Scene:
         shape = None if domain is None else PartShape.of(self._model.attention_mask, faces, domain)
         self.outline.show(shape)
 
-    def show_grip(self, grip: Grip | None) -> bool:
-        """Paint the patch of a grip over the colours of the mesh, or none.
-
-        Returns
-        -------
-        changed : whether the grip differs from the previous one
-        """
-        return self._patch.show(grip)
-
     def fit_to_screen(self, device_pixel_ratio: float) -> None:
         """Fit outline, patch, marks and shadow to the pose and camera, just before a picture.
 
@@ -245,7 +236,7 @@ class Scene:
         # Use plain arrays: pyvista treats slices of its own arrays as the whole.
         vertices, normals = np.asarray(self.surface.vertices), np.asarray(self.surface.normals)
         self.outline.fit(vertices, normals, device_pixel_ratio)
-        self._patch.fit(device_pixel_ratio)
+        self.patch.fit(device_pixel_ratio)
         self.marks.fit(self.view, device_pixel_ratio)
         # Hide the shadow from below, where the floor is culled too.
         is_above = (self.view.position - self._floor.position) @ self._up > 0.0

@@ -171,7 +171,6 @@ class Viewport(QWidget):
     pointed : `pointed_vertex` may have changed
     menu_wanted : int or None, int or None and QPoint: the right-clicked domain and vertex, and the
         position on the screen
-    painted : float, the seconds that one picture took; see `Canvas.painted`
     hinted : str, hint for the current drag; "" as it ends
     """
 
@@ -179,7 +178,6 @@ class Viewport(QWidget):
     shading_changed = Signal(object)
     pointed = Signal()
     menu_wanted = Signal(object, object, QPoint)
-    painted = Signal(float)
     hinted = Signal(str)
 
     def __init__(self, document: PoseDocument) -> None:
@@ -413,7 +411,7 @@ class Viewport(QWidget):
             self.canvas.shut_down()
             self._layout.removeWidget(self.canvas)
             self.canvas.deleteLater()
-        self.canvas = self.scene = None
+        self.canvas = self.scene = self.mouse = None
 
     # Overridden from Qt.
 
@@ -447,9 +445,8 @@ class Viewport(QWidget):
         model = self._document.model
         if self.canvas is None:
             self.canvas = Canvas(self._bring_up_to_date, self)
-            self.canvas.painted.connect(self.painted)
             self.canvas.menu_wanted.connect(self._on_menu_wanted)
-            self.mouse = Mouse(self._document, self.canvas, self._present_scene)
+            self.mouse = Mouse(self._document, self.canvas)
             self.mouse.pointed.connect(self._on_pointed)
             self.mouse.whole_body_dragged.connect(self._show_tag)
             self.mouse.hinted.connect(self.hinted)
@@ -470,8 +467,7 @@ class Viewport(QWidget):
         self.shown_frame = None
         self._highlight = None
         assert self.mouse is not None
-        # Vertices of the previous model are not valid in this one.
-        self.mouse.reset()
+        self.mouse.reset(self.scene)
         self._place_camera = view is None
         if view is not None:
             self.scene.view = view
@@ -543,10 +539,6 @@ class Viewport(QWidget):
         self._loaded = self._document.history.latent
 
     # Drawing.
-
-    def _present_scene(self) -> Scene:
-        assert self.scene is not None
-        return self.scene
 
     def _recolour(self, crossing: bool = False) -> None:
         self._colours_stale = True

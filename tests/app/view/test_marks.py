@@ -38,8 +38,8 @@ def test_the_patch_is_painted_where_it_is_and_nowhere_else(
     before = steady_pixels(qtbot, viewport)
     vertex = seen_vertex(viewport, 1)
     grip = make_grip(viewport._document.model.space, vertex, 0.08)
-    assert scene.show_grip(grip)
-    assert not scene.show_grip(grip)
+    assert scene.patch.show(grip)
+    assert not scene.patch.show(grip)
     canvas.redraw()
     painted = changed(before, steady_pixels(qtbot, viewport))
     column, row = _places(viewport, scene.surface.vertices[[vertex]])[0].astype(int)
@@ -51,7 +51,7 @@ def test_the_patch_is_painted_where_it_is_and_nowhere_else(
         spread = np.ptp(seen)
         assert seen.min() - 0.5 * spread - 6 < drawn.min()
         assert drawn.max() < seen.max() + 0.5 * spread + 6
-    assert scene.show_grip(None)
+    assert scene.patch.show(None)
     canvas.redraw()
     assert not changed(before, steady_pixels(qtbot, viewport)).any()
 

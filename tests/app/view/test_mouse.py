@@ -420,7 +420,7 @@ def test_a_drag_ends_with_its_model(qtbot: QtBot, viewport: Viewport) -> None:
     settled(qtbot, viewport)
     scene, latent = viewport.scene, document.history.latent
     assert scene is not None
-    assert not scene.show_grip(None)
+    assert not scene.patch.show(None)
     QTest.mouseMove(canvas, place + QPoint(40, 0))
     QTest.mouseRelease(canvas, LEFT, NO_KEY, place + QPoint(40, 0))
     settled(qtbot, viewport)
@@ -436,7 +436,7 @@ def test_a_drag_that_another_action_ends_shows_no_target(qtbot: QtBot, viewport:
     drag(qtbot, viewport, place, QPoint(25, 0), let_go=False)
     document.history.undo()
     QTest.mouseMove(canvas, place + QPoint(40, 0))
-    assert not scene.show_grip(None)
+    assert not scene.patch.show(None)
     settled(qtbot, viewport)
     assert scene.marks._line is None
     QTest.mouseRelease(canvas, LEFT, NO_KEY, place + QPoint(40, 0))

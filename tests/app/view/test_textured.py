@@ -251,11 +251,11 @@ def test_a_patch_and_colliding_faces_are_seen_on_the_texture(draw: Draw) -> None
     corner = int(np.linalg.norm(front.model.reference - [1.0, 1.0, 1.0], axis=1).argmin())
     assert len(vertices) == 24
     before = front.at(0.9, 0.9)
-    front.scene.show_grip(make_grip(front.model.space, corner, 0.2))
+    front.scene.patch.show(make_grip(front.model.space, corner, 0.2))
     front.scene.fit_to_screen(1.0)
     assert front.at(0.9, 0.9) != before
     assert front.at(-0.5, -0.5) == list(BLUE)
-    front.scene.show_grip(None)
+    front.scene.patch.show(None)
     assert front.at(0.9, 0.9) == before
     front.scene.crossing.show(np.array([[0, 1]], dtype=np.int32))
     red, green, blue = front.at(0.5, 0.5)

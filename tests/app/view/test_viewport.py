@@ -375,7 +375,7 @@ def test_resolve_transitions_to_the_new_pose_and_leaves_a_ghost(
     viewport._transition.setDuration(400)
     with qtbot.waitSignal(document.tasks.solve_finished, timeout=20_000):
         document.tasks.resolve()
-    viewport.painted.connect(lambda _: between.append(scene.surface.vertices.copy()))
+    viewport.canvas.painted.connect(lambda _: between.append(scene.surface.vertices.copy()))
     rest(qtbot, viewport)
     assert document.motion.frame is not None
     end = document.motion.frame.vertices
