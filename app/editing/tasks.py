@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from app.editing.library import Library
     from app.editing.live_pose import PoseMotion
     from lcollision_core.bodies import Body, MirroredPose, NamedPose, OtherModelError, ProposedRules
-    from lcollision_core.contact import ContactRules
+    from lcollision_core.contact import ContactRules, SelfCollisions
     from lcollision_core.files import Character, FileStamp
     from lcollision_core.files.scene_files import SceneDocument
     from lcollision_core.jobs import Job
@@ -107,7 +107,7 @@ class Tasks(QObject):
     of_other_model : OtherModelError, if a poses file needs another known model
     of_member : MemberPose, if a poses file is of one of the scene's bodies
     wrong_scale : Path and WrongScaleError, if a mesh to import is in another unit
-    contacts_counted : ContactsAtRest
+    contacts_counted : SelfCollisions of the rest pose
     pairs_proposed : dict of tuples of ProposedPair, by kind of group
     rules_proposed : `proposed_rules` is new
     """
@@ -356,9 +356,12 @@ class Tasks(QObject):
 
     def count_contacts(self) -> None:
         """Count the pairs of the rest pose by contact rule, for `contacts_counted`."""
-        job = as_task(changing.contacts_at_rest, self._model)
-        done = self.contacts_counted.emit
-        self.start(Work.COUNT_CONTACTS, "Counting pairs at rest", job, done)
+        body, done = self._model, self.contacts_counted.emit
+
+        def count(_: Job) -> SelfCollisions:
+            return body.detector.detect(body.reference)
+
+        self.start(Work.COUNT_CONTACTS, "Counting pairs at rest", count, done)
 
     def propose_pairs(self) -> None:
         """Find groups that touch in nearly every pose of the body, for `pairs_proposed`."""

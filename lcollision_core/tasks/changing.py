@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from lcollision_core.bodies import Body, ProposedRules
     from lcollision_core.contact import ProposedPair
-    from lcollision_core.meshes import ContactRules, RuleCounts
+    from lcollision_core.meshes import ContactRules
 
 
 def require_changeable(name: str | Path) -> Path:
@@ -79,26 +79,6 @@ def set_rules(body: Body, file: str, rules: ContactRules) -> OpenedModel:
     if not (body.is_trained and is_bundled(file)):
         change_body(body, file, lambda kept: kept.with_rules(rules), "its contact rules")
     return OpenedModel(body.with_rules(rules), file)
-
-
-@dataclass(frozen=True)
-class ContactsAtRest:
-    """Contacts of the rest pose under the contact rules.
-
-    Attributes
-    ----------
-    n_counted : colliding pairs that count
-    excluded : number of pairs that each rule excludes
-    """
-
-    n_counted: int
-    excluded: RuleCounts
-
-
-def contacts_at_rest(body: Body) -> ContactsAtRest:
-    """Count the colliding pairs of the rest pose, and those that each rule excludes."""
-    collisions = body.detector.detect(body.reference)
-    return ContactsAtRest(len(collisions.pairs), collisions.excluded)
 
 
 def propose_pairs(body: Body, job: Job) -> dict[str, tuple[ProposedPair, ...]]:

@@ -38,9 +38,8 @@ from lcollision_core.tasks.words import counted, with_capital
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from lcollision_core.contact import ContactRules, ProposedPair
+    from lcollision_core.contact import ContactRules, ProposedPair, SelfCollisions
     from lcollision_core.meshes import FaceGroup
-    from lcollision_core.tasks.changing import ContactsAtRest
 
 _WIDTH, _BORDER = 400, WIDE + 4
 _COUNTING = "Counting pairs at rest…"
@@ -348,15 +347,14 @@ class ContactsDialog(Dialog):
         self._on_edited()
 
     @Slot(object)
-    def _on_counted(self, found: ContactsAtRest) -> None:
+    def _on_counted(self, at_rest: SelfCollisions) -> None:
         """Show how many pairs of the rest pose each rule excludes."""
         for name, label in self.counts.items():
-            label.setText(f"{counted(getattr(found.excluded, name), 'pair', 'pairs')} at rest")
-        left = counted(found.n_counted, "pair", "pairs")
-        count_text = (
-            f"At rest {counted(found.excluded.total, 'pair', 'pairs')} not counted, {left} counted."
-        )
-        if found.n_counted:
+            label.setText(f"{counted(getattr(at_rest.excluded, name), 'pair', 'pairs')} at rest")
+        left = counted(len(at_rest.pairs), "pair", "pairs")
+        left_out = counted(at_rest.excluded.total, "pair", "pairs")
+        count_text = f"At rest {left_out} not counted, {left} counted."
+        if at_rest.colliding:
             count_text += " Pairs that collide at rest collide in every pose: widen a rule."
         self._write(self.total, count_text)
 

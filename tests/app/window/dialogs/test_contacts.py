@@ -20,7 +20,7 @@ from lcollision_core.bodies import LearnedBody, RigBody, open_body, typical_pose
 from lcollision_core.contact import propose_by_kind
 from lcollision_core.meshes import ContactRules
 from lcollision_core.meshes.face_groups import FaceGroup, without_joints
-from lcollision_core.tasks.changing import PartEdits, contacts_at_rest
+from lcollision_core.tasks.changing import PartEdits
 from tests.app.windows import PATIENCE, rest, take_picture
 from tests.core.gltf_builder import arm
 from tests.rigged_shapes import head_in_torso, rigged_body, sunk_arm
@@ -62,7 +62,7 @@ def test_rules_are_applied_counted_and_tinted(
     assert viewport.shading is Shading.EXACT
     # This is the dialog's shading, not the user's choice.
     assert window.settings["shading"] == remembered != "exact"
-    pairs = contacts_at_rest(body).n_counted
+    pairs = len(body.detector.detect(body.reference).pairs)
     assert pairs > 0
     assert dialog.total.text().startswith(f"At rest 0 pairs not counted, {pairs} pairs counted.")
     assert not dialog.apply.isEnabled()
@@ -118,7 +118,7 @@ def test_a_pair_of_groups_is_tolerated_up_to_a_depth(
     qtbot: QtBot, window: MainWindow, body: RigBody
 ) -> None:
     document, dialog = window.document, dialog_of(qtbot, window)
-    assert contacts_at_rest(body).n_counted > 0
+    assert body.detector.detect(body.reference).colliding
     for box, name in ((dialog.first, "LeftArm"), (dialog.second, "RightArm")):
         box.setCurrentIndex(box.findText(name))
     for percent in (5.0, 10.0):
@@ -306,7 +306,8 @@ def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     QTest.mouseClick(dialog.apply, LEFT)
     qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert document.model.rules.ignored == ignored
-    assert contacts_at_rest(document.model).excluded.ignored > 0
+    model = document.model
+    assert model.detector.detect(model.reference).excluded.ignored > 0
     dialog.close()
 
 
