@@ -51,7 +51,7 @@ from lcollision_core.files.formats import (
     SKELETON_SUFFIXES,
 )
 from lcollision_core.tasks.editing import save_poses
-from lcollision_core.tasks.opening import AnimationAlone, OtherMesh
+from lcollision_core.tasks.opening import Unposable
 from lcollision_core.tasks.words import counted, menu_text, say
 
 if TYPE_CHECKING:
@@ -277,7 +277,7 @@ class FileActions(QObject):
 
     def _open_examined(self, path: Path, beside: Body | None, read: FileContent) -> None:
         """Open an examined file, or ask whether it joins the open body."""
-        is_body = read is not None and not isinstance(read, AnimationAlone)
+        is_body = read is not None and read is not Unposable.CLIPS
         if is_body and beside is not None and not beside.is_of_file(path):
             # The task must have ended, and the window must show so, before the question.
             QTimer.singleShot(0, self, partial(self._ask_to_join, path, beside, read))
@@ -285,7 +285,7 @@ class FileActions(QObject):
             self._open_read(path, read)
 
     def _ask_to_join(self, path: Path, beside: Body, read: FileContent) -> None:
-        is_prop = isinstance(read, OtherMesh)
+        is_prop = read is Unposable.OTHER_MESH
         answer = ask_to_join(self._window, path.name, beside.name, is_prop)
         if answer is Choice.SAVE:
             self._attempt(partial(self.add_to_scene, path))
@@ -294,9 +294,9 @@ class FileActions(QObject):
 
     def _open_read(self, path: Path, read: FileContent) -> None:
         """Open a file that was read: a body if rigged, else a motion or mesh of the open one."""
-        if isinstance(read, AnimationAlone):
+        if read is Unposable.CLIPS:
             self._attempt(partial(self.open_motion, path))
-        elif read is None or isinstance(read, OtherMesh):
+        elif read is None or isinstance(read, Unposable):
             is_asked = path.suffix.lower() not in CHARACTER_SUFFIXES
             self._attempt(partial(self._import_mesh, path, is_asked=is_asked))
         elif self._attempt(self.confirm_losing_changes):
@@ -561,6 +561,7 @@ class FileActions(QObject):
         ------
         LCollisionError : a source file of the scene would be replaced.
         """
+        from lcollision_core.tasks.exporting import refuse_to_replace, source_files
         from lcollision_core.tasks.scenes import files_of_members
 
         title, start = "Export each body to a folder", str(self._folder())
@@ -568,6 +569,7 @@ class FileActions(QObject):
         if not folder:
             return None
         files = files_of_members(Path(folder), scene, mesh_format, of_motion=of_motion)
+        refuse_to_replace(files, source_files(scene))
         there = [file for file in files if file.exists()]
         if there and not ask_to_replace_files(self._window, there):
             return None

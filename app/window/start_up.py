@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, Qt, QTimer, Slot
 
+from app.editing.live_pose import training_pose
 from app.window.dialogs.questions import Choice, ask_about_recovery
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.formats import MODEL_SUFFIX, POSES_SUFFIX
-from lcollision_core.tasks.opening import AnimationAlone, OtherMesh
+from lcollision_core.tasks.opening import Unposable
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -70,7 +71,7 @@ class StartUp(QObject):
             self._document.tasks.examine(path, self._open_rigged, self._open_without_path)
 
     def _open_rigged(self, read: FileContent) -> None:
-        body = None if isinstance(read, AnimationAlone | OtherMesh) else read
+        body = None if isinstance(read, Unposable) else read
         self._open_model(body is not None, body)
 
     def _open_model(self, is_in_path: bool, read: SceneDocument | Character | None = None) -> None:
@@ -146,7 +147,7 @@ def opening_pose(model: Body) -> NamedPose:
     This is the first pose of the bundled poses file with the model's name. Without one, it is the
     first training pose named in `_LIVELY`, or else the last; for a character, the rest pose.
     """
-    from lcollision_core.bodies import NamedPose, read_poses
+    from lcollision_core.bodies import read_poses
 
     bundled = bundled_folder("poses") / f"{model.name}.json"
     if bundled.is_file():
@@ -157,6 +158,6 @@ def opening_pose(model: Body) -> NamedPose:
             _log.info("no opening pose: %s", error)
     names = model.card.pose_names
     if not model.is_trained:
-        return NamedPose(names[0], model.known_poses[0])
+        return training_pose(model, 0)
     number = next((names.index(name) for name in _LIVELY if name in names), len(names) - 1)
-    return NamedPose(names[number], model.known_poses[number])
+    return training_pose(model, number)

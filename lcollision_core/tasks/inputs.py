@@ -191,17 +191,9 @@ def _may_hold_motion(path: Path) -> bool:
         names = array_names(path)
         has_meshes = bool({"vertices", "V"} & set(names))
         return not names or has_meshes or is_generated(path) or is_smpl_motion(path)
-    return _has_clips(path)
-
-
-def _has_clips(path: Path) -> bool:
-    """Whether a file is a scene with clips, or a damaged scene."""
-    if path.suffix.lower() not in SCENE_SUFFIXES:
-        return False
     try:
-        return bool(read_scene(path).clips)
+        return suffix in SCENE_SUFFIXES and bool(read_scene(path).clips)
     except MeshFileError:
-        # Its row reports the error.
         return True
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from lcollision_core.files.scene_files import SceneDocument
     from lcollision_core.motion import Motion
 
-    FileContent: TypeAlias = "SceneDocument | Character | AnimationAlone | OtherMesh | None"
+    FileContent: TypeAlias = "SceneDocument | Character | Unposable | None"
     """The contents of a file; None for a mesh of the open body."""
 
 
@@ -53,49 +54,38 @@ class OpenedModel:
 def open_model(
     name_or_path: str | Path,
     job: Job = UNWATCHED,
-    up: int | None = None,
     read: SceneDocument | Character | None = None,
 ) -> OpenedModel:
     """Read a model, a character or a scene, and remember a character's file.
 
     Parameters
     ----------
-    up : the up axis of a character, which is remembered too
     read : content of the file, if already read
 
     Raises
     ------
     LCollisionError : as in `open_body` and `open_scene_file`.
     """
-    from lcollision_core.bodies import find_model, open_body, remember_file, remember_up
+    from lcollision_core.bodies import find_model, open_body, remember_file
     from lcollision_core.bodies.scene_file import is_scene_file, open_scene_file
 
     path = find_model(name_or_path).absolute()
     if is_scene_file(path):
         return OpenedModel(open_scene_file(path), str(path))
-    model = open_body(path if read is None else read, up)
+    model = open_body(path if read is None else read)
     job.check()
     try:
         remember_file(model, path)
-        if up is not None:
-            remember_up(model, up)
     except ModelFileError as error:
         model = model.noted(error.headline)
     return OpenedModel(model, str(path))
 
 
-@dataclass(frozen=True)
-class AnimationAlone:
-    """A file of clips without a mesh; they are motions of the open body."""
+class Unposable(Enum):
+    """A file without a body to pose: clips alone, which move the open body, or another mesh."""
 
-    path: Path
-
-
-@dataclass(frozen=True)
-class OtherMesh:
-    """A file with a mesh that does not belong to the open body."""
-
-    path: Path
+    CLIPS = auto()
+    OTHER_MESH = auto()
 
 
 def examine(path: Path, job: Job, beside: Body | None = None) -> FileContent:
@@ -114,10 +104,10 @@ def examine(path: Path, job: Job, beside: Body | None = None) -> FileContent:
         if document.has_skin:
             return document
         if is_animation_alone(document):
-            return AnimationAlone(path)
+            return Unposable.CLIPS
     if beside is None or read_mesh(path).topology.n_vertices == beside.n_vertices:
         return None
-    return OtherMesh(path)
+    return Unposable.OTHER_MESH
 
 
 @dataclass(frozen=True, eq=False)

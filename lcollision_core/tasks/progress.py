@@ -99,11 +99,16 @@ class Run(Generic[T]):
         if time.monotonic() - self._written > pause:
             self._write()
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether all items are finished."""
+        return len(self.done) == self._total
+
     def stop(self) -> None:
         """Write the progress, and note how to continue."""
         if not (self.done and self._write()):
             return
-        if len(self.done) == self._total:
+        if self.is_complete:
             stopped = say(
                 "stopped; {path} has {done}, run the command again when they can be written",
                 path=self.path,
@@ -189,21 +194,8 @@ def run_of_poses(
     key = key_of(body, *depends_on)
     items = counted(total, "pose", "poses")
     run = Run(path, key, total, items, read, write, job, _SECONDS_BETWEEN_WRITES)
-    with locked(path, wait=0.0):
-        run.begin()
-        try:
-            yield run
-        except LCollisionError as error:
-            # Otherwise an error of the command itself would recur on the next run.
-            if isinstance(error, CancelledError) or len(run.done) == total:
-                run.stop()
-            else:
-                run.finish()
-            raise
-        except BaseException:
-            run.stop()
-            raise
-        run.finish()
+    with _kept(run, keeps_failures=False):
+        yield run
 
 
 @contextmanager
@@ -231,14 +223,29 @@ def run_of_rows(
     def write(path: Path, record: dict[str, Any], done: dict[str, dict[str, Any]]) -> None:
         write_bytes(path, json.dumps({**record, "done": done}).encode())
 
-    with locked(path, wait=0.0):
-        items = counted(total, "file", "files")
-        run = Run(path, key, total, items, read, write, job, pause=-1.0)
+    items = counted(total, "file", "files")
+    run = Run(path, key, total, items, read, write, job, pause=-1.0)
+    with _kept(run, keeps_failures=True):
+        yield run
+
+
+@contextmanager
+def _kept(run: Run[Any], *, keeps_failures: bool) -> Iterator[None]:
+    """Lock and load a run's progress; write it if the block fails, and remove it at the end.
+
+    Without `keeps_failures`, an error of the command itself removes it, lest it recur on the next
+    run; an interruption, or an error after the last item, does not.
+    """
+    with locked(run.path, wait=0.0):
         run.begin()
         try:
-            yield run
-        except BaseException:
-            run.stop()
+            yield
+        except BaseException as error:
+            is_own = isinstance(error, LCollisionError) and not isinstance(error, CancelledError)
+            if is_own and not keeps_failures and not run.is_complete:
+                run.finish()
+            else:
+                run.stop()
             raise
         run.finish()
 

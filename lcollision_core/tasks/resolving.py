@@ -582,20 +582,14 @@ def run_of_motions(
     request: ResolveMotionsRequest, motions: Sequence[Motion], job: Job
 ) -> AbstractContextManager[Run[KeptPose]]:
     """Return the run of some motions, with consecutive frame numbers."""
-    body, files = request.body, request.files
-    inputs = _inputs_of_motions(body, files, motions, request.options)
-    return run_of_poses(request.output.path, body, inputs, sum(map(len, motions)), job)
-
-
-def _inputs_of_motions(
-    body: Body, files: Sequence[Path], motions: Sequence[Motion], options: MotionOptions
-) -> tuple[Arrays, dict[str, Any]]:
+    body, options = request.body, request.options
     arrays, values = depends_on(body, options.frame)
     # The file stamps stand for shapes of frames, which codes do not include.
-    values = {**values, "files": [_stamp(path) for path in files]}
+    values |= {"files": [_stamp(path) for path in request.files], **_settings(options)}
     for number, motion in enumerate(motions):
         arrays |= {f"codes {number}": motion.codes, f"times {number}": motion.times}
-    return arrays, {**values, **_settings(options), "command": "resolve --motion"}
+    inputs = arrays, values | {"command": "resolve --motion"}
+    return run_of_poses(request.output.path, body, inputs, sum(map(len, motions)), job)
 
 
 def _settings(options: MotionOptions) -> dict[str, Any]:

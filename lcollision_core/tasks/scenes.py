@@ -709,20 +709,7 @@ def playing(scene: SceneFile, number: int, clip: str, start: float) -> SceneFile
 def files_of_members(
     folder: Path, body: SceneBody, mesh_format: str | None = None, *, of_motion: bool
 ) -> list[Path]:
-    """Return the files that an export of a scene writes, one or two per body.
-
-    Raises
-    ------
-    LCollisionError : one of them is a source file of the scene.
-    """
-    files = _files_of_members(folder, body, mesh_format, of_motion=of_motion)
-    refuse_to_replace(files, source_files(body))
-    return files
-
-
-def _files_of_members(
-    folder: Path, body: SceneBody, mesh_format: str | None = None, *, of_motion: bool
-) -> list[Path]:
+    """Return the files that an export of a scene writes, one or two per body."""
     files = [folder / file for _, file in written_members(body, mesh_format)]
     return files + [file.with_suffix(".pc2") for file in files if of_motion]
 
@@ -784,7 +771,7 @@ def resolve_scene_motion(
         )
     outputs = [output.path]
     if output.form == "folder":
-        outputs = _files_of_members(output.path, body, of_motion=True)
+        outputs = files_of_members(output.path, body, of_motion=True)
     read = [played_motion.file for played_motion in of_bodies if played_motion.file is not None]
     refuse_to_replace(outputs, [*read, *source_files(body)], in_place=in_place)
     with run_of_motions(request, [motion], job) as run:
