@@ -6,9 +6,10 @@ import io
 import json
 import sys
 import zipfile
-from importlib.metadata import files, version
+from importlib.metadata import files
 from pathlib import Path
 
+from lcollision_core import __version__
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
 
@@ -33,7 +34,7 @@ def addon_zip() -> bytes:
     }
     contents["client.py"] = _client()
     contents |= {f"msgpack/{name}": data for name, data in _codec().items()}
-    engine = {"python": sys.executable, "version": version("lcollision")}
+    engine = {"python": sys.executable, "version": __version__}
     contents["engine.json"] = json.dumps(engine, indent=1).encode() + b"\n"
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as file:

@@ -13,6 +13,7 @@ from io import BufferedReader
 from threading import Lock
 from typing import Any, BinaryIO, cast
 
+from lcollision_core import __version__
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import Job, at_most_every, available_cores
 from lcollision_core.serve import messages as m
@@ -115,14 +116,8 @@ class Session:
             )
             self._refuse(request.id, error)
             return
-        from importlib.metadata import PackageNotFoundError, version
-
-        try:
-            program = version("lcollision")
-        except PackageNotFoundError:
-            program = "unknown"
         self._greeted = True
-        greeting = {"version": m.PROTOCOL_VERSION, "program": program}
+        greeting = {"version": m.PROTOCOL_VERSION, "program": __version__}
         self._send(request.id, "hello", greeting)
 
     def _begin(self, request: Any) -> None:

@@ -8,13 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core import __version__
 from lcollision_core.bodies import LearnedBody, save_trained
 from lcollision_core.bodies.proposed_rules import places_of, propose_rules
 from lcollision_core.bodies.scoring import CARD_POSES, score_kinds
@@ -510,7 +510,7 @@ def learn_latent_space(
     trained = train_embedding(poses, config, checkpoint=checkpoint, seed=seed, job=job)
     digest = hashlib.sha256(np.ascontiguousarray(poses.vertices).tobytes()).hexdigest()
     provenance = {
-        "program": f"lcollision {version('lcollision')}",
+        "program": f"lcollision {__version__}",
         "poses_sha256": digest,
         "training": asdict(config),
         **({"poses": dict(poses.provenance)} if poses.provenance else {}),

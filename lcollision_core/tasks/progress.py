@@ -12,6 +12,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy.typing as npt
 
+from lcollision_core import __version__
 from lcollision_core.bodies import Body, NamedPose, read_poses, write_poses
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.files import locked
@@ -252,9 +253,7 @@ def _kept(run: Run[Any], *, keeps_failures: bool) -> Iterator[None]:
 
 def key_of(body: Body, arrays: Mapping[str, npt.NDArray[Any]], values: Any) -> str:
     """Return the key of a run: of its body, its inputs, and the program's version."""
-    from importlib.metadata import version
-
-    of_all = {"model": body.fingerprint, "version": version("lcollision")}
+    of_all = {"model": body.fingerprint, "version": __version__}
     return run_key(arrays, {**values, **of_all})
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
@@ -12,6 +11,7 @@ from PySide6.QtWidgets import QDialogButtonBox, QFormLayout, QLabel, QMessageBox
 from app.view.theme import CLOSE, NORMAL, WIDE, program_icon
 from app.window.dialogs.questions import Dialog, message_box, widen
 from app.window.widgets import described, dialog_vbox, labelled, screen_of, scrolling
+from lcollision_core import __version__
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body
@@ -78,7 +78,7 @@ _ABOUT_MODEL = """
 
 def show_about(model: Body | None, parent: QWidget) -> None:
     """Show name, version, licence and origin of the program and of the model."""
-    box = message_box(parent, "About LCollision", "LCollision", _ABOUT.format(version=_version()))
+    box = message_box(parent, "About LCollision", "LCollision", _ABOUT.format(version=__version__))
     if model is not None:
         origin = "trained on" if model.is_trained else "posed by the rig of"
         text = _ABOUT_MODEL.format(model=model, n_parts=len(model.domain_names), origin=origin)
@@ -134,10 +134,3 @@ class ShortcutsDialog(Dialog):
         # Without it, no key would scroll to the keys below.
         area.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         area.setFocus()
-
-
-def _version() -> str:
-    try:
-        return version("lcollision")
-    except PackageNotFoundError:
-        return "of a checkout"
