@@ -17,7 +17,7 @@ from app.work.threads import LongWork
 from lcollision_core.tasks.opening import OpenedModel
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import Body
+    from lcollision_core.bodies import Body, SceneBody
 
 
 class PoseDocument(QObject):
@@ -84,6 +84,13 @@ class PoseDocument(QObject):
     def model(self) -> Body:
         """The model that the pose belongs to."""
         return self.history.model
+
+    @property
+    def scene(self) -> SceneBody | None:
+        """The model if it is a scene of several bodies; None for one body, or without a model."""
+        from lcollision_core.bodies import as_scene
+
+        return as_scene(self.model) if self.has_model else None
 
     def set_model(self, model: Body) -> None:
         """Load another model, with a new pose and the user's library of it.

@@ -329,10 +329,9 @@ class FileActions(QObject):
 
     def remove_from_scene(self, name: str) -> None:
         """Open the scene without one of its bodies; the others keep their pose."""
-        from lcollision_core.bodies import as_scene
         from lcollision_core.tasks.scenes import without_body
 
-        scene = as_scene(self._document.model)
+        scene = self._document.scene
         assert scene is not None
         self._open_in_pose(lambda *_: without_body(scene, name), removed=name)
 
@@ -351,10 +350,9 @@ class FileActions(QObject):
 
     def play_clip(self, name: str, clip: str, start: float) -> None:
         """Let a body of the scene play a clip that starts after `start` seconds."""
-        from lcollision_core.bodies import as_scene
         from lcollision_core.tasks.scenes import kept_scene, playing
 
-        scene = as_scene(self._document.model)
+        scene = self._document.scene
         assert scene is not None
         assert scene.file is not None
         if self.confirm_losing_changes(with_library=False):
@@ -375,13 +373,12 @@ class FileActions(QObject):
 
     def save_scene(self) -> None:
         """Ask for a file and write the scene's composition to it."""
-        from lcollision_core.bodies import as_scene
         from lcollision_core.bodies.scene_file import write_scene_file
 
-        scene = as_scene(self._document.model)
+        scene = self._document.scene
         if scene is None or scene.file is None:
             return
-        path = self.ask_save("Save scene", scene.name, {"Scene": POSES_SUFFIX}, None)
+        path = self.ask_save("Save scene", scene.name, {"Scene": POSES_SUFFIX})
         if path is not None:
             write_scene_file(path, scene.file)
             self._remember(path)
@@ -440,11 +437,9 @@ class FileActions(QObject):
 
     def export(self) -> None:
         """Ask how and where, and write the pose as a mesh; of a scene, one file per body."""
-        from lcollision_core.bodies import as_scene
         from lcollision_core.tasks import exporting, scenes
 
-        document = self._document
-        scene = as_scene(document.model)
+        document, scene = self._document, self._document.scene
         if scene is not None:
             pose = document.history.pose
             bodies = SceneExportDialog(self.settings, self._window, scene)
@@ -496,7 +491,6 @@ class FileActions(QObject):
         -------
         begun : whether writing has begun; False if the user cancelled
         """
-        from lcollision_core.bodies import as_scene
         from lcollision_core.files.motion.smpl import is_smpl_motion
 
         document, timeline = self._document, self._document.timeline
@@ -504,9 +498,8 @@ class FileActions(QObject):
         changes = timeline.changes
         if motion is None or file is None:
             raise LCollisionError("there is no motion", "open one first")
-        scene = as_scene(model)
-        if scene is not None:
-            return self._export_scene_motion(scene, motion)
+        if document.scene is not None:
+            return self._export_scene_motion(document.scene, motion)
         form = MotionDialog(self.settings, self._window, model, motion.rate, timeline)
         accepted = run_form(form)
         kinds, request, frames = form.kinds, form.export_request, form.frames
@@ -520,11 +513,8 @@ class FileActions(QObject):
         if path is None:
             return False
         is_clip = is_clip or (is_own_smpl and path.suffix.lower() == own_suffix)
-
-        def done(told: str) -> None:
-            timeline.mark_saved([now for _, now in changes] if is_clip else [motion])
-            document.message.emit(told)
-
+        exported = [now for _, now in changes] if is_clip else [motion]
+        done = partial(self._on_motions_exported, exported)
         if is_clip:
             from lcollision_core.tasks import exporting
 
@@ -538,19 +528,18 @@ class FileActions(QObject):
     def _export_scene_motion(self, scene: SceneBody, motion: Motion) -> bool:
         from lcollision_core.tasks import scenes
 
-        document, timeline = self._document, self._document.timeline
-        original = timeline.original
+        original = self._document.timeline.original
         folder = self._ask_folder_of_bodies(scene, of_motion=True)
         if folder is None or original is None:
             return False
-
-        def done(told: str) -> None:
-            timeline.mark_saved([motion])
-            document.message.emit(told)
-
         work = partial(scenes.export_scene_motion, folder, scene, original, motion)
-        document.tasks.write(f"Exporting {folder.name}", work, done)
+        done = partial(self._on_motions_exported, [motion])
+        self._document.tasks.write(f"Exporting {folder.name}", work, done)
         return True
+
+    def _on_motions_exported(self, exported: Sequence[Motion], sentence: str) -> None:
+        self._document.timeline.mark_saved(exported)
+        self._document.message.emit(sentence)
 
     def _ask_folder_of_bodies(
         self, scene: SceneBody, mesh_format: str | None = None, *, of_motion: bool = False
@@ -773,10 +762,8 @@ class FileActions(QObject):
     @Slot(object)
     def _on_member(self, read: MemberPose) -> None:
         """Give one body of the scene the pose of its file; the others keep theirs."""
-        from lcollision_core.bodies import as_scene
-
         document, pose, name = self._document, read.pose, read.members[0]
-        scene = as_scene(document.model)
+        scene = document.scene
         if len(read.members) > 1:
             title, text = "Open poses", f"Which body takes the pose “{pose.name}”?"
             name, is_chosen = QInputDialog.getItem(

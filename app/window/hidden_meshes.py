@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -95,14 +94,12 @@ class HiddenMeshes(QObject):
         model, key = self._document.model, self._key(name)
         others = [known for known in self._settings["hidden_meshes"] if known != key]
         self._settings["hidden_meshes"] = (*others, *(key,) * hidden)[-_MOST_REMEMBERED:]
-        left_out = [known for known in model.rules.left_out if known != name]
-        rules = replace(model.rules, left_out=(*left_out, *(name,) * hidden))
-        told = say("{mesh} is shown and checked", mesh=name)
+        text = say("{mesh} is shown and checked", mesh=name)
         if hidden:
-            told = say(
+            text = say(
                 "{mesh} is hidden and not checked; it is still posed and exported", mesh=name
             )
-        self._document.tasks.set_rules(rules, told)
+        self._document.tasks.set_rules(model.rules.leaving_out(name, hidden), text)
 
     def _key(self, name: str) -> str:
         return f"{self._document.model.fingerprint} {name}"

@@ -267,7 +267,7 @@ class MainWindow(EditorWindow):
             # Start another body with the shading last used for its kind.
             self._topology = topology
             self.viewport.set_shading(remembered_shading(self))
-        if self.bodies.scene is not None:
+        if self.document.scene is not None:
             # For a single body, `HiddenMeshes` decides what is drawn.
             self._hide_faces(self.bodies.hidden_faces)
         self._update_title()

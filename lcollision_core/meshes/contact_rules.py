@@ -257,6 +257,11 @@ class ContactRules:
         """Return the rules as JSON values for `from_json`."""
         return to_json(self)
 
+    def leaving_out(self, name: str, left_out: bool) -> ContactRules:
+        """Return these rules with a group of faces left out of the check, or checked."""
+        others = tuple(other for other in self.left_out if other != name)
+        return replace(self, left_out=(*others, name) if left_out else others)
+
     @classmethod
     def from_json(cls, values: Any) -> ContactRules:
         """Rebuild the rules from the values of `to_json`; missing rules are off.

@@ -108,9 +108,7 @@ def _toggle_standing(window: EditorWindow) -> None:
 
 
 def _has_ground(window: EditorWindow) -> bool:
-    from lcollision_core.bodies import as_scene
-
-    scene = as_scene(window.document.model) if window.document.has_model else None
+    scene = window.document.scene
     return scene is not None and any(member.is_ground for member in scene.members)
 
 

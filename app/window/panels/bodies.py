@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -116,21 +115,14 @@ class BodiesPanel(QWidget):
         self._follow()
 
     @property
-    def scene(self) -> SceneBody | None:
-        """The scene that is open, None for one body."""
-        from lcollision_core.bodies import as_scene
-
-        return as_scene(self._document.model) if self._document.has_model else None
-
-    @property
     def n_bodies(self) -> int:
         """Number of bodies of the scene, not counting the ground; 1 without a scene."""
-        members = () if self.scene is None else self.scene.members
+        members = () if self._document.scene is None else self._document.scene.members
         return max(1, sum(not member.is_ground for member in members))
 
     @Slot()
     def _follow(self) -> None:
-        scene = self.scene
+        scene = self._document.scene
         if scene is None:
             return
         if scene.fingerprint != self._fingerprint:
@@ -167,7 +159,7 @@ class BodiesPanel(QWidget):
     @Slot()
     def _show_clip(self) -> None:
         """Show the clip of the selected body."""
-        scene, row = self.scene, self.tree.currentItem()
+        scene, row = self._document.scene, self.tree.currentItem()
         name = "" if row is None else row.text(_NAME)
         played = None if scene is None else scene.plays.get(name)
         self.playing.setVisible(played is not None)
@@ -183,7 +175,7 @@ class BodiesPanel(QWidget):
 
     @Slot()
     def _want_clip(self) -> None:
-        scene, row = self.scene, self.tree.currentItem()
+        scene, row = self._document.scene, self.tree.currentItem()
         if scene is None or row is None:
             return
         name, choice = row.text(_NAME), (self.clip.currentText(), self.start.value())
@@ -192,7 +184,7 @@ class BodiesPanel(QWidget):
 
     @Slot()
     def _want_removal(self) -> None:
-        if self.scene is not None and (row := self.tree.currentItem()) is not None:
+        if self._document.scene is not None and (row := self.tree.currentItem()) is not None:
             self.removal_wanted.emit(row.text(_NAME))
 
     def _rows(self) -> list[QTreeWidgetItem]:
@@ -202,7 +194,7 @@ class BodiesPanel(QWidget):
     @property
     def hidden_faces(self) -> npt.NDArray[np.bool_] | None:
         """(F,) mask of the faces of hidden bodies, None if all are drawn."""
-        scene = self.scene
+        scene = self._document.scene
         if scene is None or not self._hidden:
             return None
         hidden = np.zeros(len(scene.faces), dtype=np.bool_)
@@ -212,7 +204,7 @@ class BodiesPanel(QWidget):
 
     @Slot(QTreeWidgetItem, int)
     def _on_changed(self, row: QTreeWidgetItem, column: int) -> None:
-        scene = self.scene
+        scene = self._document.scene
         if scene is None or column == _NAME:
             return
         name, is_on = row.text(_NAME), row.checkState(column) is Qt.CheckState.Checked
@@ -229,12 +221,11 @@ class BodiesPanel(QWidget):
             self._document.motion.set_locked(domain, locked)
 
     def _count(self, scene: SceneBody, name: str, *, counted: bool) -> None:
-        others = [one for one in scene.rules.left_out if one != name]
-        left_out = (*others, *(name,) * (not counted))
-        told = say("{body} is checked", body=name)
+        rules = scene.rules.leaving_out(name, not counted)
+        text = say("{body} is checked", body=name)
         if not counted:
-            told = say("{body} is not checked: its collisions don't count", body=name)
-        self._document.tasks.set_rules(replace(scene.rules, left_out=left_out), told)
+            text = say("{body} is not checked: its collisions don't count", body=name)
+        self._document.tasks.set_rules(rules, text)
 
 
 def _row_of(name: str) -> QTreeWidgetItem:

@@ -482,12 +482,10 @@ class SliderGroup(QWidget):
             row.show_name(name, width)
 
     def _make_rows(self) -> None:
-        from lcollision_core.bodies import as_scene
-
         document, codes = self._panel.document, self._group.codes
         order: list[QWidget] = [self.header.button]
         # In a scene, the sliders of several bodies have the same names.
-        names_bodies, body = self._domain is None and as_scene(document.model) is not None, ""
+        names_bodies, body = self._domain is None and document.scene is not None, ""
         for index, code in enumerate(range(codes.start, codes.stop)):
             of_body, colon, _ = document.model.code_names[code].rpartition(": ")
             if names_bodies and colon and of_body != body:
