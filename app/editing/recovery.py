@@ -325,9 +325,9 @@ class Autosave(QObject):
     def _on_read(
         self,
         lost: RecoverablePose,
-        found: tuple[ReadPoses | OtherModelError, EditedMotions | Failure | None],
+        contents: tuple[ReadPoses | OtherModelError, EditedMotions | Failure | None],
     ) -> None:
-        (read, motions), document, history = found, self._document, self._document.history
+        (read, motions), document, history = contents, self._document, self._document.history
         if isinstance(read, LCollisionError):
             document.failed.emit(Failure.of(read))
             return

@@ -369,14 +369,14 @@ class Tasks(QObject):
         done = self.pairs_proposed.emit
         self.start(Work.PROPOSE_PAIRS, "Looking for pairs in contact", job, done)
 
-    def set_rules(self, rules: ContactRules, told: str = "The new contact rules apply") -> None:
+    def set_rules(self, rules: ContactRules, sentence: str = "The new contact rules apply") -> None:
         """Apply other contact rules in the long worker, and store them in the model's own file.
 
-        The pose, its history and the locks stay; the change cannot be undone. `told` is the
+        The pose, its history and the locks stay; the change cannot be undone. `sentence` is the
         message once the rules apply.
         """
         job = as_task(changing.set_rules, self._model, self._history.model_file, rules)
-        done = partial(self._on_rules, told)
+        done = partial(self._on_rules, sentence)
         self.start(Work.CHANGE_MODEL, "Applying the contact rules", job, done)
 
     def open_poses(self, path: str | Path, model_file: str | Path | None = None) -> None:
@@ -550,7 +550,7 @@ class Tasks(QObject):
         self.model_exchanged.emit(changed)
         self.message.emit(f"Saved the body parts in {changed.model.name}")
 
-    def _on_rules(self, told: str, changed: OpenedModel) -> None:
+    def _on_rules(self, sentence: str, changed: OpenedModel) -> None:
         history = self._history
         if changed.model.fingerprint != self._model.fingerprint:
             return
@@ -560,7 +560,7 @@ class Tasks(QObject):
         self.proposed_rules, self.offers_rules = None, False
         history.amend(replace(history.state, outcome=None))
         self.model_exchanged.emit(changed)
-        self.message.emit(told)
+        self.message.emit(sentence)
 
     def _on_encoded(self, path: Path, pose: NamedPose | WrongScaleError) -> None:
         if isinstance(pose, WrongScaleError):

@@ -445,11 +445,11 @@ class Timeline(QObject):
             self.first, self.last = ends
             self.range_changed.emit()
 
-    def _at(self, motion: Motion, frame: int, held: PoseFrame | None = None) -> DocumentState:
+    def _at(self, motion: Motion, frame: int, cached: PoseFrame | None = None) -> DocumentState:
         """Return the state at a frame, with the pins moved to its patches."""
         from lcollision_core.bodies import MAX_POSE_NAME_LENGTH, NamedPose
 
-        codes = motion.codes[frame] if held is None else held.latent
+        codes = motion.codes[frame] if cached is None else cached.latent
         ending = f" {frame}"
         name = motion.name[: MAX_POSE_NAME_LENGTH - len(ending)] + ending
         pose = NamedPose(name, codes, motion.placement(frame))
@@ -457,7 +457,7 @@ class Timeline(QObject):
         state = DocumentState(pose, moment=moment, ghost=self._ghost(motion, frame))
         if not self._history.pose.pins:
             return state
-        vertices = state.drawn(self._history.model) if held is None else held.vertices
+        vertices = state.drawn(self._history.model) if cached is None else cached.vertices
         return replace(state, pose=replace(pose, pins=self._pose.pins_on(vertices)))
 
     def _go(self, frame: int) -> None:

@@ -95,7 +95,7 @@ class Mnemonics(QObject):
             else:
                 new.append(item)
         for item in new:
-            text = _MARK.sub(lambda found: found[1] or "&&", item.text())
+            text = _MARK.sub(lambda mark: mark[1] or "&&", item.text())
             marked = _with_mark(text, letters)
             letters.add(mnemonic(marked))
             if marked != item.text():

@@ -582,8 +582,8 @@ class FileActions(QObject):
 
         label, write = f"Exporting {path.name}", self._document.tasks.write
 
-        def ask_and_write(found: tuple[list[Path], SourceFile | None]) -> None:
-            files, source = found
+        def ask_and_write(of_export: tuple[list[Path], SourceFile | None]) -> None:
+            files, source = of_export
             export = partial(exporting.export_frames, model, motion, path, request, source=source)
             # The file dialog has already asked about the path itself.
             there = [file for file in files if file != path and file.exists()]
@@ -750,14 +750,14 @@ class FileActions(QObject):
         self._last_message = sentence
 
     @Slot(object)
-    def _on_other_model(self, found: OtherModelError) -> None:
-        assert found.model is not None
-        name = found.model.name
+    def _on_other_model(self, error: OtherModelError) -> None:
+        assert error.model is not None
+        name = error.model.name
         # If both models have the same name, the question says what differs.
-        differs = found.what if name == self._document.model.name else ""
-        may_switch = ask_to_switch(self._window, Path(found.where).name, name, differs)
+        differs = error.what if name == self._document.model.name else ""
+        may_switch = ask_to_switch(self._window, Path(error.where).name, name, differs)
         if may_switch and self._may_lose_library():
-            self._document.tasks.open_poses(found.where, found.model.path)
+            self._document.tasks.open_poses(error.where, error.model.path)
 
     @Slot(object)
     def _on_member(self, read: MemberPose) -> None:
@@ -799,10 +799,10 @@ class FileActions(QObject):
         self.settings.remember_file(str(path.resolve()))
 
     @Slot(object, object)
-    def _offer_scale(self, path: Path, found: WrongScaleError) -> None:
+    def _offer_scale(self, path: Path, error: WrongScaleError) -> None:
         """Ask whether to scale a mesh in another unit; if so, import it."""
-        if ask_about_scale(self._window, path.name, found):
-            self._document.tasks.import_mesh(path, found.factor)
+        if ask_about_scale(self._window, path.name, error):
+            self._document.tasks.import_mesh(path, error.factor)
 
     def _remember_folder(self, path: Path) -> None:
         self.settings["last_folder"] = str(path.resolve().parent)

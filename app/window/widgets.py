@@ -229,7 +229,7 @@ def _fill(layout: QBoxLayout, items: Iterable[QWidget | QLayout | None]) -> None
             layout.addStretch()
 
 
-def held(layout: QLayout) -> QWidget:
+def widget_of(layout: QLayout) -> QWidget:
     """Return a widget that holds a layout, without margins."""
     holder = QWidget()
     layout.setContentsMargins(0, 0, 0, 0)

@@ -121,10 +121,10 @@ class Session:
         self._send(request.id, "hello", greeting)
 
     def _begin(self, request: Any) -> None:
-        def told(done: int, total: int) -> None:
+        def report(done: int, total: int) -> None:
             self._send(request.id, "progress", {"done": done, "total": total})
 
-        job = Job(at_most_every(_BETWEEN_PROGRESS, told))
+        job = Job(at_most_every(_BETWEEN_PROGRESS, report))
         with self._jobs_lock:
             is_known = self._jobs.setdefault(request.id, job) is not job
         if is_known:

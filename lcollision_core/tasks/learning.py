@@ -656,7 +656,7 @@ class _Learner:
             return LearnedBody.load(path)
         checkpoint = self._work.checkpoint(Stage.LATENT_SPACE)
 
-        def told(status: TrainingStatus) -> None:
+        def report(status: TrainingStatus) -> None:
             error = status.both_error or status.level1_error
             facts = [] if error is None else [f"error {100.0 * error:.2f} %"]
             self._at(_TRAINED * status.done / status.total, facts)
@@ -670,7 +670,7 @@ class _Learner:
             licence=request.licence,
             facts={"command": "new", "notes": list(poses.notes), "request": to_json(request)},
             checkpoint=checkpoint,
-            job=self._job.part(told),
+            job=self._job.part(report),
         )
         model, first = adapt_to_samples(model, request, self._part(_TRAINED))
         provenance = {
@@ -687,7 +687,7 @@ class _Learner:
         work, effort, seed = self._work, self._effort, self._request.seed
         self._enter(Stage.LABELS)
 
-        def told_rows(status: LabelStatus) -> None:
+        def report_rows(status: LabelStatus) -> None:
             share = status.colliding_share
             facts = [] if share is None else [f"{100.0 * share:.0f} % of the samples collide"]
             self._at(status.done / status.total, facts)
@@ -697,12 +697,12 @@ class _Learner:
             work.labels,
             effort.n_samples,
             seed=seed,
-            job=self._job.part(told_rows),
+            job=self._job.part(report_rows),
         )
         self._enter(Stage.PREDICTOR)
         store = LabelStore.open(work.labels)
 
-        def told_epochs(status: PredictorStatus) -> None:
+        def report_epochs(status: PredictorStatus) -> None:
             if status.preparing is not None:
                 done = _PATCHES * status.preparing
             else:
@@ -717,7 +717,7 @@ class _Learner:
             groups=model.groups,
             checkpoint=work.checkpoint(Stage.PREDICTOR),
             seed=seed,
-            job=self._job.part(told_epochs),
+            job=self._job.part(report_epochs),
         )
         learned = LearnedPredictor(model, trained)
         finished = learned.with_scores(effort.n_judged, seed, self._part(_PASSES)).of(model)

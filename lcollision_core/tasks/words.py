@@ -95,7 +95,7 @@ def menu_text(name: str) -> str:
 
 def one_line(text: str) -> str:
     """Escape the characters of a text that would break or reverse its line."""
-    return _NOT_IN_A_LINE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+    return _NOT_IN_A_LINE.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
 
 
 def fit_error(mean: float | None, most: float | None, *, is_mirrored: bool = False) -> str:

@@ -17,7 +17,7 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import NORMAL, ROW_HEIGHT
 from app.window.dialogs.questions import Dialog, free_model_name, why_no_model_name
-from app.window.widgets import described, hbox, held, labelled, push_button, swatch_icon, vbox
+from app.window.widgets import described, hbox, labelled, push_button, swatch_icon, vbox, widget_of
 from lcollision_core.errors import ModelFileError
 from lcollision_core.tasks.changing import PartEdits
 
@@ -79,7 +79,7 @@ class BodyPartsDialog(Dialog):
         copy_label = labelled("Name of the copy", "caption")
         self.copy_name = described(QLineEdit(free_model_name(model.name, 2)), "", copy_label.text())
         copy_label.setBuddy(self.copy_name)
-        copy_row = held(hbox(copy_label, self.copy_name))
+        copy_row = widget_of(hbox(copy_label, self.copy_name))
         copy_row.setVisible(copies)
         self.refusal = labelled("", "refusal", wraps=True)
         self.refusal.hide()
@@ -179,5 +179,5 @@ class BodyPartsDialog(Dialog):
         self.down.setEnabled(0 <= row < self.list.count() - 1)
 
 
-def _count(held: QListWidget, name: str) -> int:
-    return [held.item(row).text().strip() for row in range(held.count())].count(name)
+def _count(listed: QListWidget, name: str) -> int:
+    return [listed.item(row).text().strip() for row in range(listed.count())].count(name)

@@ -27,11 +27,11 @@ from app.window.widgets import (
     described,
     dialog_vbox,
     hbox,
-    held,
     labelled,
     push_button,
     screen_of,
     vbox,
+    widget_of,
 )
 from lcollision_core.errors import ShapeError
 from lcollision_core.tasks.words import counted, with_capital
@@ -240,7 +240,7 @@ class ContactsDialog(Dialog):
             choice.setStretchFactor(box, 1)
         beyond = labelled("or count only deeper than", "caption")
         deeper = hbox(beyond, None, self.own_depth, self.tolerate)
-        return held(vbox(title, self.ignored, choice, deeper, spacing=CLOSE))
+        return widget_of(vbox(title, self.ignored, choice, deeper, spacing=CLOSE))
 
     def _field(self, name: str) -> NumberBox:
         field = described(NumberBox(2, 0.0, _MOST[name]), "In per cent of the body size")
@@ -324,8 +324,8 @@ class ContactsDialog(Dialog):
             self._list(pair, _CHECKED)
         self._name_kinds()
         self._list_parts(rules)
-        for one in rules.tolerated_pairs:
-            self._list_tolerated(one)
+        for entry in rules.tolerated_pairs:
+            self._list_tolerated(entry)
         groups = without_joints(model.groups)
         materials = dict.fromkeys(group.name for group in groups if group.is_material)
         others = dict.fromkeys(group.name for group in groups if group.name not in materials)
@@ -416,15 +416,15 @@ class ContactsDialog(Dialog):
         names = self.first.currentText(), self.second.currentText()
         self.ignored.scrollToItem(self._list_tolerated((*names, self.own_depth.value() / _PERCENT)))
 
-    def _list_tolerated(self, one: tuple[str, str, float]) -> QTreeWidgetItem:
-        """Add the ticked item of a pair and its tolerated depth, replacing an earlier one."""
+    def _list_tolerated(self, entry: tuple[str, str, float]) -> QTreeWidgetItem:
+        """Add the ticked item of a pair and its tolerated depth, replacing an earlier entry."""
         from lcollision_core.meshes.contact_rules import pair_in_words
 
-        for known in [known for known in self._tolerated if {*known[:2]} == {*one[:2]}]:
+        for known in [known for known in self._tolerated if {*known[:2]} == {*entry[:2]}]:
             self.ignored.invisibleRootItem().removeChild(self._tolerated.pop(known))
-        text = f"{pair_in_words(one[:2])}: up to {_PERCENT * one[2]:g} %"
+        text = f"{pair_in_words(entry[:2])}: up to {_PERCENT * entry[2]:g} %"
         tip = "Ticked: contact between these two counts only beyond this depth"
-        item = self._tolerated[one] = _ticked_item(self.ignored, text, _CHECKED, tip)
+        item = self._tolerated[entry] = _ticked_item(self.ignored, text, _CHECKED, tip)
         self._on_edited()
         return item
 
@@ -557,7 +557,7 @@ def _ticked_item(
     return item
 
 
-def _length(field: NumberBox, held: float | None) -> float:
-    """Return a field's normalised length, or `held` unrounded while the field still shows it."""
-    percentage = None if held is None else round(_PERCENT * held, field.decimals())
-    return field.value() / _PERCENT if held is None or field.value() != percentage else held
+def _length(field: NumberBox, current: float | None) -> float:
+    """Return a field's normalised length, or `current` unrounded while the field still shows it."""
+    percentage = None if current is None else round(_PERCENT * current, field.decimals())
+    return field.value() / _PERCENT if current is None or field.value() != percentage else current

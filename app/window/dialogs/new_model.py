@@ -38,7 +38,6 @@ from app.window.widgets import (
     described,
     dialog_vbox,
     hbox,
-    held,
     labelled,
     plain_tip,
     push_button,
@@ -46,6 +45,7 @@ from app.window.widgets import (
     screen_of,
     scrolling,
     vbox,
+    widget_of,
 )
 from app.work import learning_runs
 from lcollision_core.tasks.words import (
@@ -123,7 +123,7 @@ class FilesPage(Page):
     ----------
     list : of the files
     add_files, add_folder, remove : buttons; the dialog connects the first two
-    found : label with the contents of the files, or a problem
+    contents : label with the contents of the files, or a problem
     """
 
     paths_changed = Signal()
@@ -144,12 +144,12 @@ class FilesPage(Page):
         delete.activated.connect(self._remove)
         self.remove.setEnabled(False)
         self.list.currentRowChanged.connect(lambda row: self.remove.setEnabled(row >= 0))
-        self.found = labelled("", "caption", wraps=True)
-        self.found.setAlignment(Qt.AlignmentFlag.AlignTop)
+        self.contents = labelled("", "caption", wraps=True)
+        self.contents.setAlignment(Qt.AlignmentFlag.AlignTop)
         buttons = hbox(self.add_files, self.add_folder, None, self.remove)
         self.column.addWidget(self.list, 1)
         self.column.addLayout(buttons)
-        self.column.addWidget(self.found)
+        self.column.addWidget(self.contents)
         self._problem = ""
 
     @property
@@ -174,9 +174,9 @@ class FilesPage(Page):
     def tell(self, text: str, is_problem: bool = False) -> None:
         """Show the contents of the files, or why they cannot be used."""
         self._problem = text if is_problem else ""
-        self.found.setObjectName("refusal" if is_problem else "caption")
-        self.found.setText(text)
-        restyle(self.found)
+        self.contents.setObjectName("refusal" if is_problem else "caption")
+        self.contents.setText(text)
+        restyle(self.contents)
 
     def show_summary(self, summary: SourcesSummary) -> None:
         """Show the notes on what was found, and what was changed on reading."""
@@ -241,7 +241,7 @@ class PosesPage(Page):
         self.number.setValue(100)
         self._rig = self._card(
             "Poses made by the rig",
-            held(hbox(self.by_rig, self.number, None)),
+            widget_of(hbox(self.by_rig, self.number, None)),
             labelled(
                 "The rig bends its joints within human limits, left and right alike, and prefers "
                 "poses in which the body doesn't cross itself.",
@@ -457,7 +457,7 @@ class QualityPage(Page):
             rows.addWidget(button)
             rows.addWidget(meaning)
         self.choices[Quality.GOOD].setChecked(True)
-        self._card("Quality", held(rows))
+        self._card("Quality", widget_of(rows))
         self.name = QLineEdit(maxLength=60)
         self.licence = described(
             QLineEdit(placeholderText="unknown"),
@@ -539,7 +539,7 @@ class _Rule(_ExplainedCard):
         self.field.setAccessibleName(title)
         self.field.setEnabled(False)
         self.own.toggled.connect(self.field.setEnabled)
-        self.choice = held(hbox(self.own, self.field, None))
+        self.choice = widget_of(hbox(self.own, self.field, None))
         self.add(self.choice)
 
     def value(self) -> float | None:
@@ -552,7 +552,7 @@ def _form(*rows: tuple[str, QWidget]) -> QWidget:
     form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=CLOSE)
     for label, field in rows:
         form.addRow(label, field)
-    return held(form)
+    return widget_of(form)
 
 
 _SIZE, _MARGIN = QSize(900, 640), QSize(20, 60)
@@ -669,7 +669,7 @@ class NewModelDialog(Dialog):
             self._stack.addWidget(scrolling(page))
         column = vbox(self.preview, self._facts, spacing=CLOSE)
         column.setStretchFactor(self.preview, 1)
-        side = held(column)
+        side = widget_of(column)
         side.setFixedWidth(_PREVIEW_WIDTH)
         self.refusal = labelled("", "refusal", wraps=True)
         cancel = push_button("Cancel", clicked=self.reject)

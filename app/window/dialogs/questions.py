@@ -213,11 +213,11 @@ def ask_to_join(parent: QWidget, file: str, model: str, is_prop: bool = False) -
     return _ask(parent, "Another body", text, note, buttons, default)
 
 
-def ask_about_scale(parent: QWidget, file: str, found: WrongScaleError) -> bool:
+def ask_about_scale(parent: QWidget, file: str, error: WrongScaleError) -> bool:
     """Ask whether to scale and import a mesh that is in another unit."""
     text = f"“{file}” seems to be in another unit."
     note = (
-        f"{with_capital(found.headline)}. Scaled by {found.factor:.6g} it fits; an export "
+        f"{with_capital(error.headline)}. Scaled by {error.factor:.6g} it fits; an export "
         f"restores its own size."
     )
     return _confirm(parent, "Another unit", text, note, ("Scale and import", "Cancel"))

@@ -21,7 +21,7 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import TIGHT
 from app.window.layout import Docking
-from app.window.widgets import described, hbox, held, labelled, plain_tip, push_button
+from app.window.widgets import described, hbox, labelled, plain_tip, push_button, widget_of
 from lcollision_core.tasks.words import say
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class BodiesPanel(QWidget):
             "Start of the clip",
         )
         row = hbox(labelled("Plays"), self.clip, labelled("at"), self.start, spacing=TIGHT)
-        self.playing = held(row)
+        self.playing = widget_of(row)
         layout = QVBoxLayout(self)
         layout.addWidget(self.tree)
         layout.addWidget(self.playing)

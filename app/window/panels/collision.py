@@ -48,7 +48,6 @@ from app.window.widgets import (
     bar_style,
     described,
     hbox,
-    held,
     labelled,
     longest_name,
     plain_tip,
@@ -59,6 +58,7 @@ from app.window.widgets import (
     title_row,
     unbroken,
     vbox,
+    widget_of,
 )
 from lcollision_core.tasks.words import (
     counted,
@@ -289,7 +289,7 @@ class PredictionCard(PoseCard):
         self.learn.setObjectName("action")
         self.learn.clicked.connect(learn_action.trigger)
         why = labelled(_BY_RIG, "caption", wraps=True)
-        self._by_rig = held(hbox(why, self.learn, wide=why))
+        self._by_rig = widget_of(hbox(why, self.learn, wide=why))
         self._by_rig.hide()
         self.verdict = ElidedLabel("")
         self.percent = described(labelled("", "aside"), _TIP)
@@ -447,8 +447,8 @@ class ResolveCard(Card):
         self.cancel = push_button("Cancel", tip, document.tasks.cancel_resolve)
         self.bar = QProgressBar(textVisible=False)
         progress = vbox(ElidedLabel("Searching for a pose…"), self.bar, spacing=TIGHT)
-        self.working = held(hbox(progress, self.cancel, spacing=NORMAL))
-        self.resting = held(hbox(self.button, self.options, wide=self.button))
+        self.working = widget_of(hbox(progress, self.cancel, spacing=NORMAL))
+        self.resting = widget_of(hbox(self.button, self.options, wide=self.button))
         # Stack both rows, so that the layout does not jump.
         self.stack = QStackedWidget()
         self.stack.addWidget(self.resting)

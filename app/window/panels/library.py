@@ -46,11 +46,11 @@ from app.window.widgets import (
     Slider,
     described,
     hbox,
-    held,
     labelled,
     plain_tip,
     signals_blocked,
     vbox,
+    widget_of,
 )
 from app.work.threads import single_shot
 from lcollision_core.tasks.words import menu_text, one_line
@@ -260,7 +260,7 @@ class LibraryPanel(QWidget):
         bar.setStretchFactor(self.search, 1)
         target = hbox(self._target, self._share, wide=self._target)
         rows = (self.keep, self.update_button, self.add_button, self.blend)
-        side = held(vbox(*rows[:3], None, target, self.blend, spacing=TIGHT))
+        side = widget_of(vbox(*rows[:3], None, target, self.blend, spacing=TIGHT))
         side.setFixedWidth(182)
         poses = hbox(side, self.list, wide=self.list, spacing=NORMAL)
         page = vbox(bar, poses, margins=(NORMAL, TIGHT, NORMAL, TIGHT))

@@ -256,7 +256,7 @@ class CodeRow(HoverRow):
         self.slider.number_wanted.connect(self._move)
         self.slider.reset_wanted.connect(lambda: document.motion.reset_code(code))
         self.field.valueChanged.connect(lambda value: self._move(self._from_field(value)))
-        self.field.refused.connect(lambda told: document.message.emit(f"{name}: {told}"))
+        self.field.refused.connect(lambda reason: document.message.emit(f"{name}: {reason}"))
 
     @staticmethod
     def width_beside(name: int, number: int) -> int:

@@ -26,11 +26,11 @@ from app.window.widgets import (
     NumberBox,
     described,
     hbox,
-    held,
     labelled,
     push_button,
     signals_blocked,
     vbox,
+    widget_of,
 )
 from lcollision_core.tasks.words import (
     counted,
@@ -159,7 +159,7 @@ class TimelinePanel(QWidget):
         more.setToolTipsVisible(True)
         more.addActions([actions[key] for key in ("resolve_motion", "resolve_range", "resolve")])
         resolve.setMenu(more)
-        self.working = held(hbox(self.bar, self.keep, self.cancel, spacing=TIGHT))
+        self.working = widget_of(hbox(self.bar, self.keep, self.cancel, spacing=TIGHT))
         # Only the strip grows in height.
         self.working.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
         self.working.hide()

@@ -234,7 +234,7 @@ def test_what_cannot_be_learned_from_stays_on_the_first_page(
     broken.write_bytes(b"no poses")
     window.files.open_path(broken)
     wizard = wizard_of(qtbot, window)
-    qtbot.waitUntil(lambda: "broken.npz" in wizard.files.found.text(), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: "broken.npz" in wizard.files.contents.text(), timeout=PATIENCE)
     wizard.next.click()
     assert wizard.page is wizard.files
     assert wizard.refusal.text() == "Remove the file that can't be used."
@@ -252,7 +252,7 @@ def test_what_cannot_be_learned_from_stays_on_the_first_page(
     wizard.next.click()
     assert wizard.refusal.text() == "Wait for the files to be read."
     qtbot.waitUntil(lambda: wizard.preview.has_body, timeout=PATIENCE)
-    assert not wizard.files.found.text()
+    assert not wizard.files.contents.text()
     for _ in range(3):
         wizard.next.click()
     editor_model.save(model_destination("taken"))
