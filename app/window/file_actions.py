@@ -323,9 +323,9 @@ class FileActions(QObject):
 
     def add_to_scene(self, path: Path) -> None:
         """Open the current body, in its pose, and one more beside it as a scene."""
-        from lcollision_core.tasks.scenes import kept_scene, with_body
+        from lcollision_core.tasks.scenes import with_body
 
-        self._open_in_pose(lambda body, file: kept_scene(with_body(body, file, path)))
+        self._open_in_pose(partial(with_body, path=path))
 
     def remove_from_scene(self, name: str) -> None:
         """Open the scene without one of its bodies; the others keep their pose."""
@@ -335,7 +335,7 @@ class FileActions(QObject):
         assert scene is not None
         self._open_in_pose(lambda *_: without_body(scene, name), removed=name)
 
-    def _open_in_pose(self, changed: Callable[[Body, str], str | Path], removed: str = "") -> None:
+    def _open_in_pose(self, changed: Callable[[Body, str], str], removed: str = "") -> None:
         """Open the file made from the current body and its file, with bodies as they are posed."""
         history = self._document.history
         if self._confirm_losing_motions() and self._may_lose_library():

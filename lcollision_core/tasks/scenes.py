@@ -161,14 +161,14 @@ def _scene_around(body: Body, body_file: str) -> SceneFile:
     return scene_file or SceneFile((ScenePart(str(Path(body_file).absolute())),))
 
 
-def with_body(body: Body, body_file: str, path: Path) -> SceneFile:
-    """Return a body or a scene with another body beside it.
+def with_body(body: Body, body_file: str, path: Path) -> str:
+    """Return the file of a body or a scene with another body beside it.
 
     Raises
     ------
-    LCollisionError : the file cannot be read.
+    LCollisionError : the file cannot be read, or the scene file cannot be written.
     """
-    return beside(_scene_around(body, body_file), path.absolute())
+    return str(kept_scene(beside(_scene_around(body, body_file), path.absolute())))
 
 
 def without_body(scene: SceneBody, name: str) -> str:

@@ -289,9 +289,9 @@ def test_the_ground_counts_where_it_is_wanted(qtbot: QtBot, hero: Path, tmp_path
 
 def test_a_further_body_stands_beside_what_is_open(hero: Path) -> None:
     body = open_body(hero)
-    scene = open_scene_file(kept_scene(with_body(body, str(hero), hero)))
+    scene = open_scene_file(Path(with_body(body, str(hero), hero)))
     assert not scene.detector.detect(scene.reference).colliding
-    more = open_scene_file(kept_scene(with_body(scene, "", hero)))
+    more = open_scene_file(Path(with_body(scene, "", hero)))
     assert [member.name for member in more.members] == ["hero", "hero 2", "hero 3"]
     assert as_scene(body) is None
 
