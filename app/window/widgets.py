@@ -552,9 +552,11 @@ def screen_of(window: QWidget) -> QRect:
     return (screen or QGuiApplication.primaryScreen()).availableGeometry()
 
 
-def wheel_if_focused(widget: QWidget, event: QWheelEvent, handle: object) -> None:
+def wheel_if_focused(
+    widget: QWidget, event: QWheelEvent, handle: Callable[[QWheelEvent], None]
+) -> None:
     """Pass a wheel event to `handle` if focused, else ignore it so that the parent scrolls."""
-    if widget.hasFocus() and callable(handle):
+    if widget.hasFocus():
         handle(event)
     else:
         event.ignore()
