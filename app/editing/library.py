@@ -57,6 +57,20 @@ class Library(QObject):
         store = self._history.store
         return () if store is None else store.poses
 
+    def of_members(self) -> list[NamedPose]:
+        """Return the library poses of each body of an open scene, which leave the others alone."""
+        from lcollision_core.bodies import NamedPose, as_scene
+        from lcollision_core.bodies.rig_poses import StarterPose
+        from lcollision_core.tasks.scenes import placed_pose
+
+        def own(body: Body) -> list[StarterPose]:
+            poses = [placed_pose(body, pose) for pose in self.opened(body).poses]
+            return [StarterPose(pose.name, pose.latent, pose.moves) for pose in poses]
+
+        scene = as_scene(self._history.model)
+        poses = () if scene is None else scene.poses_of_members(own)
+        return [NamedPose(pose.name, pose.codes, moves=pose.moves) for pose in poses]
+
     @property
     def is_written(self) -> bool:
         """Whether the file contains all changes."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -494,12 +494,18 @@ class SceneBody(Body):
 
     @cached_property
     def starter_poses(self) -> tuple[StarterPose, ...]:
-        """Those of each body that is posed, which leave the others as they are."""
+        """Those of each body."""
+        return self.poses_of_members(lambda body: body.starter_poses)
+
+    def poses_of_members(
+        self, poses_of: Callable[[Body], Iterable[StarterPose]]
+    ) -> tuple[StarterPose, ...]:
+        """Return poses of each body that is posed, which leave the others as they are."""
         poses = []
         for member, own in zip(self.standing, self._space.codes, strict=True):
             if not member.moves or member.is_fixed:
                 continue
-            for pose in member.body.starter_poses:
+            for pose in poses_of(member.body):
                 codes = np.zeros(self.latent_size)
                 moves = np.zeros(self.latent_size, dtype=np.bool_)
                 codes[own] = pose.codes

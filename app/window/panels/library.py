@@ -192,6 +192,7 @@ class LibraryPanel(QWidget):
         super().__init__()
         self._document = document
         self._poses: list[NamedPose] = []
+        self._starters: list[NamedPose] = []
         self._tag = ""
         self._pictures: dict[bytes, QIcon] = {}
         self._hidden: npt.NDArray[np.bool_] | None = None
@@ -203,7 +204,8 @@ class LibraryPanel(QWidget):
         self._sources = QButtonGroup(self)
         self.training = self._source_button(*_BUILT_IN_TEXTS[True])
         self.starter = self._source_button(
-            "Starter poses", "Poses to start from, made by turning the character's joints"
+            "Starter poses",
+            "Poses to start from, made by turning joints, and your poses of a scene's bodies",
         )
         self.starter.setProperty("place", "middle")
         self.own = self._source_button("Library", "Your own poses of this model")
@@ -357,7 +359,7 @@ class LibraryPanel(QWidget):
             numbers = range(len(document.model.card.pose_names) if is_trained else 1)
             self._poses = [training_pose(document.model, number) for number in numbers]
         elif self.source is Source.STARTER:
-            self._poses = starter_poses(document.model)
+            self._poses = list(self._starters)
         else:
             is_library = self.source is Source.LIBRARY
             self._poses = list(
@@ -451,9 +453,10 @@ class LibraryPanel(QWidget):
         text, tip = _BUILT_IN_TEXTS[self._document.model.is_trained]
         self.training.setText(text)
         self.training.setToolTip(tip)
-        has_starters = bool(self._document.model.starter_poses)
-        self.starter.setVisible(has_starters)
-        if self.starter.isChecked() and not has_starters:
+        of_members = self._document.library.of_members()
+        self._starters = [*starter_poses(self._document.model), *of_members]
+        self.starter.setVisible(bool(self._starters))
+        if self.starter.isChecked() and not self._starters:
             self.training.setChecked(True)
         self._pictures.clear()
         self._on_source()

@@ -33,7 +33,16 @@ from app.window.dialogs.forms import SceneExportDialog
 from app.window.dialogs.questions import FailureDialog, ask_to_join
 from app.window.main_window import MainWindow
 from app.window.widgets import NameLabel
-from lcollision_core.bodies import Body, NamedPose, as_scene, open_body, write_poses
+from lcollision_core.bodies import (
+    Body,
+    LibraryChange,
+    NamedPose,
+    PoseLibrary,
+    as_scene,
+    open_body,
+    user_poses_folder,
+    write_poses,
+)
 from lcollision_core.bodies.scene_file import open_scene_file
 from lcollision_core.tasks.scenes import kept_scene, scene_of_files, with_body
 from tests.app.windows import PATIENCE, answer, drop, open_window, settings_in
@@ -72,6 +81,25 @@ def test_a_part_s_name_outlives_that_of_its_body(qtbot: QtBot) -> None:
     assert "mannequin".startswith(body[:-1])
     label.resize(metrics.horizontalAdvance("Left shin") + 1, 20)
     assert label.fitting() == "Left shin"
+
+
+def test_a_scene_offers_the_library_poses_of_its_bodies(
+    qtbot: QtBot, hero: Path, tmp_path: Path
+) -> None:
+    body = open_body(hero)
+    codes = 0.1 * np.random.default_rng(2).normal(size=body.latent_size)
+    library = PoseLibrary(body, user_poses_folder(), print)
+    library.change([LibraryChange(None, NamedPose("Bow", codes), 0)])
+    library.take(library.writing()())
+    scene = open_scene_file(kept_scene(scene_of_files([hero, hero])))
+    window = open_window(qtbot, PoseDocument(scene), settings_in(tmp_path))
+    window.library.starter.setChecked(True)
+    offered = {pose.name: pose for pose in window.library._poses}
+    assert {"hero: Bow", "hero 2: Bow"} <= offered.keys()
+    window.document.motion.load_pose(offered["hero 2: Bow"])
+    latent = window.document.history.latent
+    np.testing.assert_array_equal(scene.codes_of_member("hero 2", latent), codes)
+    assert not scene.codes_of_member("hero", latent).any()
 
 
 def test_bodies_of_a_scene_are_listed_locked_and_left_out(
