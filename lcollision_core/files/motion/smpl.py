@@ -654,7 +654,9 @@ def skeleton_of_smpl(motion: SmplMotion, nominal_rate: float) -> SkeletonMotion:
     turns = turns.reshape(n_frames, len(order), 3, 3)
     turns[:, 0] = frame @ turns[:, 0]
     places = np.tile(offsets, (n_frames, 1, 1))
-    places[:, 0] = (offsets[0] + motion.places) @ frame.T
+    # Without places, the body turns where it is at rest, whichever way is up.
+    if motion.places.any():
+        places[:, 0] = (offsets[0] + motion.places) @ frame.T
     times = np.arange(n_frames) / (motion.rate or nominal_rate)
     ends, axes = np.full(offsets.shape, np.nan), np.tile(np.eye(3), (len(order), 1, 1))
     note = "read as an SMPL motion and retargeted; its body shape ('betas') is ignored"

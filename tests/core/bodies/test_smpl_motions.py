@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import MotionChange, body_of_motion, read_motions, write_clips
 from lcollision_core.errors import MeshFileError
-from lcollision_core.files.motion.smpl import JOINT_NAMES
+from lcollision_core.files.motion.smpl import JOINT_NAMES, read_smpl_motion, skeleton_of_smpl
 from lcollision_core.meshes.contact_rules import ContactRules
 from lcollision_core.motion import Motion
 from tests.small_models import stored
@@ -55,6 +55,17 @@ def of_file(body: RigBody, path: Path, arrays: Arrays) -> tuple[RigBody, Motion,
     assert isinstance(shaped, RigBody)
     (motion,) = read_motions(shaped, path)
     return shaped, motion, notes
+
+
+def test_a_motion_without_places_stays_where_it_rests_whichever_way_is_up(tmp_path: Path) -> None:
+    skeletons = []
+    for z_is_up in (False, True):
+        arrays, path = motion_arrays(24, 4, z_is_up=z_is_up), tmp_path / f"{z_is_up}.npz"
+        np.savez(path, **arrays | {"trans": np.zeros((4, 3))})
+        skeletons.append(skeleton_of_smpl(read_smpl_motion(path), 30.0))
+    y_up, z_up = skeletons
+    np.testing.assert_array_equal(z_up.places, y_up.places)
+    np.testing.assert_allclose(z_up.turns, y_up.turns, atol=1e-12)
 
 
 def as_posed(arrays: Arrays, motion: Arrays, frame: int, turns: np.ndarray) -> np.ndarray:
