@@ -32,7 +32,7 @@ from app.cli.options import (
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError, listed
 from lcollision_core.options import SampleDistribution
-from lcollision_core.tasks.words import counted
+from lcollision_core.tasks.words import counted, say
 
 if TYPE_CHECKING:
     from app.cli.console import BarContent
@@ -176,7 +176,8 @@ def bar_content(status: LabelStatus) -> BarContent:
     facts = []
     if status.rows_per_second is not None and status.seconds_left is not None:
         left = timedelta(seconds=round(status.seconds_left))
-        facts += [f"{status.rows_per_second:.0f}/s", f"{left} left"]
+        rate = say("{rows:.0f}/s", rows=status.rows_per_second)
+        facts += [rate, say("{left} left", left=left)]
     if status.colliding_share is not None:
-        facts.append(f"{100.0 * status.colliding_share:.1f} % collide")
+        facts.append(say("{share:.1f} % collide", share=100.0 * status.colliding_share))
     return status.done, status.total, _TASK, facts

@@ -12,7 +12,7 @@ from app.cli.console import ExitStatus, JsonOption, note, print_json, tell
 from app.cli.contacts import rules_json, rules_sentence
 from app.cli.options import Axis, ModelArgument
 from lcollision_core.errors import LCollisionError
-from lcollision_core.tasks.words import counted, duration_text, scores_text
+from lcollision_core.tasks.words import counted, left_text, scores_text
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, LearnedBody
@@ -142,7 +142,7 @@ def _learning_sentence(report: dict[str, Any]) -> str:
     share = f"{100.0 * status['done']:.0f} % of all stages"
     if status["running"]:
         left = status["seconds_left"]
-        more = "" if left is None else f", {duration_text(left)} left"
+        more = "" if left is None else f", {left_text(left)}"
         return f"{report['name']}: is being learned: {stage}, {share}{more}"
     why = f": {status['sentence']}" if status["sentence"] else ""
     again = "run its command again to continue"

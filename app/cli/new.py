@@ -14,7 +14,7 @@ from app.cli.options import DeviceOption, ModelOutput, takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LCollisionError, listed
 from lcollision_core.options import LearningRequest
-from lcollision_core.tasks.words import duration_text, say, scores_text, spent_text
+from lcollision_core.tasks.words import left_text, say, scores_text, spent_text
 
 if TYPE_CHECKING:
     from app.cli.console import BarContent
@@ -114,6 +114,6 @@ def _print(card: LearnedCard) -> None:
 
 def bar_content_of_learning(status: LearningStatus) -> BarContent:
     """Describe the stage, its progress and the time left."""
-    stage = f"{status.stage} {100.0 * status.stage_done:.0f} %"
-    left = f"{duration_text(status.seconds_left or 0.0)} left"
-    return status.done, 1.0, "learning", [stage, left, *status.facts]
+    stage = say("{stage} {share:.0f} %", stage=status.stage, share=100.0 * status.stage_done)
+    left = left_text(status.seconds_left or 0.0)
+    return status.done, 1.0, say("learning"), [stage, left, *status.facts]

@@ -49,7 +49,7 @@ from lcollision_core.options import (
     SceneOptions,
 )
 from lcollision_core.tasks.verdicts import FailedFile
-from lcollision_core.tasks.words import duration_text, resolved_clip_text, resolved_pose_text
+from lcollision_core.tasks.words import left_text, resolved_clip_text, resolved_pose_text
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body
@@ -379,7 +379,7 @@ def _resolve_motions(
     def bar_content(status: FolderStatus) -> BarContent:
         tell_rows(status.rows)
         left = status.seconds_left
-        facts = [f"{duration_text(left)} left"] if left else []
+        facts = [left_text(left)] if left else []
         return status.n_done, status.n_files, task, facts
 
     task = "Checking motions" if request.only_check else "Resolving motions"

@@ -22,10 +22,10 @@ from app.cli.options import (
     RowsOption,
     takes_options,
 )
-from lcollision_core.errors import CancelledError
+from lcollision_core.errors import CancelledError, listed
 from lcollision_core.jobs import Job
 from lcollision_core.options import RuleOptions
-from lcollision_core.tasks.words import error_rates_text, scores_text, up_text
+from lcollision_core.tasks.words import error_rates_text, say, scores_text, up_text
 
 if TYPE_CHECKING:
     from app.cli.console import BarContent
@@ -239,17 +239,23 @@ def _resumable(
 def bar_content_of_embedding(status: TrainingStatus) -> BarContent:
     """Describe the stage and the errors of both levels."""
     levels = {"level 1": status.level1_error, "both levels": status.both_error}
-    errors = [f"{name} {100.0 * e:.2f} %" for name, e in levels.items() if e is not None]
-    facts = [f"error {', '.join(errors)}"] if errors else []
-    return status.done, status.total, f"{status.model}: learning {status.stage}", facts
+    errors = [
+        say("{levels} {share:.2f} %", levels=name, share=100.0 * error)
+        for name, error in levels.items()
+        if error is not None
+    ]
+    facts = [say("error {errors}", errors=listed(errors))] if errors else []
+    task = say("{model}: learning {stage}", model=status.model, stage=status.stage)
+    return status.done, status.total, task, facts
 
 
 def bar_content_of_predictor(status: PredictorStatus) -> BarContent:
     """Describe the epoch, the loss and the held-out error rates."""
     if status.preparing is not None:
-        return status.preparing, 1.0, "labelling patches", []
-    facts = [] if status.loss is None else [f"loss {status.loss:.3f}"]
+        return status.preparing, 1.0, say("labelling patches"), []
+    facts = [] if status.loss is None else [say("loss {loss:.3f}", loss=status.loss)]
     if any(rate is not None for rate in status.held_out_errors):
         facts.append(error_rates_text(*status.held_out_errors))
-    epoch = f"epoch {min(status.epoch + 1, status.epochs)} of {status.epochs}"
+    number = min(status.epoch + 1, status.epochs)
+    epoch = say("epoch {number} of {epochs}", number=number, epochs=status.epochs)
     return status.done, status.total, epoch, facts

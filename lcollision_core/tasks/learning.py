@@ -40,6 +40,7 @@ from lcollision_core.predictor import (
     train_predictor,
 )
 from lcollision_core.resolve import find_free_poses
+from lcollision_core.sentences import say
 from lcollision_core.tasks.sources import gather_poses, with_proposed_rules
 from lcollision_core.tasks.work_folder import WorkFolder
 
@@ -658,7 +659,7 @@ class _Learner:
 
         def report(status: TrainingStatus) -> None:
             error = status.both_error or status.level1_error
-            facts = [] if error is None else [f"error {100.0 * error:.2f} %"]
+            facts = [] if error is None else [say("error {share:.2f} %", share=100.0 * error)]
             self._at(_TRAINED * status.done / status.total, facts)
 
         model = learn_latent_space(
@@ -689,7 +690,9 @@ class _Learner:
 
         def report_rows(status: LabelStatus) -> None:
             share = status.colliding_share
-            facts = [] if share is None else [f"{100.0 * share:.0f} % of the samples collide"]
+            facts = []
+            if share is not None:
+                facts = [say("{share:.0f} % of the samples collide", share=100.0 * share)]
             self._at(status.done / status.total, facts)
 
         label_poses(

@@ -212,6 +212,11 @@ def with_capital(text: str) -> str:
     return text[:1].upper() + text[1:] if word.isalpha() else text
 
 
+def left_text(seconds: float) -> str:
+    """Format a remaining time as in "about 25 minutes left"."""
+    return say("{left} left", left=duration_text(seconds))
+
+
 def duration_text(seconds: float) -> str:
     """Format a remaining time as in "about 25 minutes", in plausible precision."""
     minutes = seconds / 60.0

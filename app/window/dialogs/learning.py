@@ -186,13 +186,14 @@ class LearningDialog(Dialog):
         state, name = run.state, one_line(run.name)
         is_done, has_ended = state == RunState.DONE, state in _ENDED
         headlines = {
-            RunState.WAITING: f"“{name}” is queued",
-            RunState.RUNNING: f"Learning “{name}”",
-            RunState.STOPPING: f"Stopping “{name}”",
-            RunState.STOPPED: f"“{name}” is paused",
-            RunState.DONE: f"“{name}” is ready",
+            RunState.WAITING: say("“{name}” is queued", name=name),
+            RunState.RUNNING: say("Learning “{name}”", name=name),
+            RunState.STOPPING: say("Stopping “{name}”", name=name),
+            RunState.STOPPED: say("“{name}” is paused", name=name),
+            RunState.DONE: say("“{name}” is ready", name=name),
         }
-        self.headline.setText(headlines.get(state, f"Learning “{name}” failed"))
+        failure = say("Learning “{name}” failed", name=name)
+        self.headline.setText(headlines.get(state, failure))
         self.state.setText(self._state(run))
         signs = {RunState.DONE: ("check", "free"), RunState.STOPPED: ("wait", "waiting")}
         failed = state in (RunState.FAILED, RunState.KILLED)
@@ -238,7 +239,8 @@ class LearningDialog(Dialog):
             return f"{with_capital(one_line(run.status.sentence))}."
         if state == RunState.DONE:
             seconds = sum(status.seconds.values())
-            return f"Added to your models. Training took {spent_text(seconds)}."
+            spent = spent_text(seconds)
+            return say("Added to your models. Training took {spent}.", spent=spent)
         if state == RunState.WAITING:
             others = [run.name for run in self._runs.runs if run.state == RunState.RUNNING]
             if others:

@@ -48,12 +48,14 @@ from app.window.widgets import (
     widget_of,
 )
 from app.work import learning_runs
+from lcollision_core.errors import listed
 from lcollision_core.tasks.words import (
     counted,
     duration_text,
     grouped,
     one_line,
     say,
+    say_number,
     spent_text,
     with_capital,
 )
@@ -330,7 +332,11 @@ class PosesPage(Page):
         values = self.values()
         frames = summary.n_given(values["clip"], values["fps"]) - summary.n_poses
         self._from_clips.setText(
-            f"Uses {counted(frames, 'animation frame', 'animation frames')} as poses."
+            say_number(
+                frames,
+                "Uses {n} animation frame as a pose.",
+                "Uses {n} animation frames as poses.",
+            )
         )
         size, scaled = summary.size, summary.size * values["scale"]
         length = f"{size:.4g}"
@@ -493,17 +499,20 @@ class QualityPage(Page):
             effort = EFFORTS[quality]
             number = n_poses(effort.n_poses)
             stages = estimated_seconds(n_vertices, number, quality)
-            spent = ", ".join(
-                f"{STAGE_WORDS[stage]} {spent_text(s)}" for stage, s in stages.items()
-            )
+            spent = listed(f"{STAGE_WORDS[stage]} {spent_text(s)}" for stage, s in stages.items())
+            time = duration_text(sum(stages.values()))
+            name = quality.capitalize()
             self.choices[quality].setText(
-                f"{quality.capitalize()}: {duration_text(sum(stages.values()))} on this computer"
+                say("{quality}: {time} on this computer", quality=name, time=time)
             )
-            samples = grouped(effort.n_samples)
-            label.setText(
-                f"{aims[quality]}: {counted(number, 'pose', 'poses')}, {samples} random ones.\n"
-                f"{with_capital(spent)}."
+            sentence = say(
+                "{aim}: {poses}, {samples} random ones.\n{spent}.",
+                aim=aims[quality],
+                poses=counted(number, "pose", "poses"),
+                samples=grouped(effort.n_samples),
+                spent=with_capital(spent),
             )
+            label.setText(sentence)
 
     def values(self) -> dict[str, Any]:
         """Return quality and licence."""
@@ -781,11 +790,16 @@ class NewModelDialog(Dialog):
 
 def _facts(summary: SourcesSummary) -> str:
     """Describe the contents of the files in a few lines."""
-    lines = [f"{counted(summary.topology.n_vertices, 'vertex', 'vertices')}"]
-    lines.append(f"{counted(summary.n_given(), 'pose', 'poses')} in the files")
-    lines.append(f"rig of {summary.n_joints} joints" if summary.n_joints else "no rig")
+    poses = counted(summary.n_given(), "pose", "poses")
+    rig = say_number(summary.n_joints, "rig of {n} joint", "rig of {n} joints")
+    lines = [
+        counted(summary.topology.n_vertices, "vertex", "vertices"),
+        say("{poses} in the files", poses=poses),
+        rig if summary.n_joints else say("no rig"),
+    ]
     if not summary.up.is_sure:
-        lines.append(f"Probably {'xyz'[summary.up.axis]} up: check the preview")
+        axis = "xyz"[summary.up.axis]
+        lines.append(say("Probably {axis} up: check the preview", axis=axis))
     return "\n".join(map(with_capital, lines))
 
 
