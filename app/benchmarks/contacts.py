@@ -33,11 +33,10 @@ from lcollision_core.built_in_body.body_set import Template, build_template, joi
 from lcollision_core.built_in_body.figure import Arm, Figure, Foot
 from lcollision_core.built_in_body.motions import JUMP_FRAME_RATE, jump_motion, swing_motion
 from lcollision_core.built_in_body.skeleton import BONES, PARENTS
-from lcollision_core.errors import LCollisionError
-from lcollision_core.files import Character, ClipFrames, Rig
+from lcollision_core.files import Character, Rig
 from lcollision_core.files.motion.bvh import read_bvh
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.topology import Topology
 from lcollision_core.motion import (
     Motion,
     MotionOptions,
@@ -78,23 +77,9 @@ def build_figure(build: str) -> tuple[RigBody, Template]:
         points=np.repeat(template.vertices[:, None], _INFLUENCES, axis=1),
     )
 
-    def sample(clip: str, fps: float | FloatArray | None) -> ClipFrames:  # noqa: ARG001
-        raise LCollisionError(f"has no clip {clip!r}", where=build)
-
-    character = Character(
-        name=build,
-        source=Path(f"{build}.glb"),
-        topology=Topology(template.faces, len(template.vertices)),
-        rest_vertices=template.vertices,
-        joined=np.arange(len(template.vertices)),
-        up=np.array([0.0, 0.0, 1.0]),
-        up_is_sure=True,
-        metres=1.0,
-        groups=(),
-        rig=rig,
-        clips={},
-        sample=sample,
-    )
+    topology = Topology(template.faces, len(template.vertices))
+    up = np.array([0.0, 0.0, 1.0])
+    character = Character.without_clips(Path(f"{build}.glb"), topology, template.vertices, up, rig)
     return RigBody.of(character), template
 
 
@@ -184,7 +169,7 @@ def moved_onto(body: RigBody, source: RigBody, motion: Motion) -> Motion:
     copied = Motion(motion.name, motion.times, codes)
     return replace(
         copied,
-        contacts=cache(lambda: contacts_of(body, copied, source, motion, retargeting)),
+        contacts=cache(lambda: contacts_of(copied, source, motion, retargeting)),
     )
 
 

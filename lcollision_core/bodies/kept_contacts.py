@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.partners import common_name
 from lcollision_core.bodies.retargeting import Retargeting
+from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
 from lcollision_core.contact.distance import triangle_distance
 from lcollision_core.meshes.joint_kinds import Role
@@ -288,7 +288,7 @@ def _at(
 
 
 def contacts_of(
-    body: Body, motion: Motion, source: Body, source_motion: Motion, retargeting: Retargeting
+    motion: Motion, source: RigBody, source_motion: Motion, retargeting: Retargeting
 ) -> KeptContacts:
     """Return the contacts of the body that a motion was made for, frame by frame.
 
@@ -298,19 +298,16 @@ def contacts_of(
 
     Parameters
     ----------
-    body : the body that the motion moves
-    motion : its poses
+    motion : poses of the body that follows the source
     source : the body that the motion was made for
     source_motion : the source's poses, at the same times or more densely
     retargeting : from the source to the body
     """
-    assert isinstance(body.space, RigPoseSpace)
-    assert isinstance(source.space, RigPoseSpace)
     since = source_motion.times - source_motion.times[0]
     nearest = np.abs(motion.times[:, None] - motion.times[0] - since).argmin(axis=1)
     frames = _frames_at(source_motion, nearest)
     both = Correspondence(retargeting, source.space, motion, frames)
-    space, names = source.space, source.domain_names
+    own_space, space, names = retargeting.space, source.space, source.domain_names
     surface, adjacent = _Samples.of(space), _adjacent(space)
     # The central vertices of contacts, by the parts and the frame.
     middles_of: dict[tuple[int, int], dict[int, tuple[int, int]]] = defaultdict(dict)
@@ -334,7 +331,7 @@ def contacts_of(
 
     @cache
     def decoded(frame: int) -> FloatArray:
-        frame_space = motion.space(frame, body.space)
+        frame_space = motion.space(frame, own_space)
         vertices: FloatArray = frame_space.decode(motion.codes[frame][None])[0]
         return vertices
 
@@ -342,7 +339,7 @@ def contacts_of(
     for name, patch, on_ground, still in _soles(
         source, both, np.array(heights), np.array(level), frames.rate
     ):
-        corners = np.unique(body.space.topology.faces[patch])
+        corners = np.unique(own_space.topology.faces[patch])
         for run in runs(on_ground):
             anchors = dict[int, FloatArray | None]()
             for stand in runs(still[run.start : run.stop]):
@@ -350,11 +347,11 @@ def contacts_of(
                 anchor = np.mean([decoded(at)[corners].mean(axis=0) for at in own_frames], axis=0)
                 anchors |= dict.fromkeys(own_frames, anchor)
             for frame in run:
-                ground_of.append(float((decoded(frame)[corners] @ body.space.up).min()))
+                ground_of.append(float((decoded(frame)[corners] @ own_space.up).min()))
                 touches[frame].append(Touch(len(contacts), patch, None, anchors.get(frame)))
             contacts.append((name, "ground"))
     ground = float(np.median(ground_of)) if ground_of else 0.0
-    return KeptContacts(touches, tuple(contacts), body.space.up, ground)
+    return KeptContacts(touches, tuple(contacts), own_space.up, ground)
 
 
 def _frames_at(motion: Motion, frames: npt.NDArray[np.intp]) -> Motion:
@@ -404,7 +401,7 @@ def _sliding(
 
 
 def _soles(
-    source: Body, both: Correspondence, heights: FloatArray, level: FloatArray, rate: float
+    source: RigBody, both: Correspondence, heights: FloatArray, level: FloatArray, rate: float
 ) -> Iterator[tuple[str, npt.NDArray[np.intp], npt.NDArray[np.bool_], npt.NDArray[np.bool_]]]:
     """Divide surfaces that touch the ground into patches.
 

@@ -496,8 +496,8 @@ class JointSides:
     between: FloatArray
 
 
-def named_pairs(names: Sequence[str]) -> list[tuple[int, int]]:
-    """Return (left, right) pairs of joints or shapes whose names differ only in the side."""
+def named_pairs(names: Sequence[str]) -> npt.NDArray[np.intp]:
+    """Return the (n, 2) left and right joints or shapes whose names differ only in the side."""
     number = {name: joint for joint, name in enumerate(names)}
     pairs = []
     for joint, name in enumerate(names):
@@ -508,7 +508,7 @@ def named_pairs(names: Sequence[str]) -> list[tuple[int, int]]:
         if other is not None:
             # A name belongs to one pair.
             pairs.append((joint, number.pop(other)))
-    return pairs
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
 
 def _on_the_right(name: str) -> list[str]:
@@ -532,7 +532,7 @@ def find_joint_sides(space: RigPoseSpace) -> JointSides | None:
     -------
     sides : None if no joint has a partner and some joint lies off the plane
     """
-    pairs = np.array(named_pairs(space.rig.joint_names), dtype=np.intp).reshape(-1, 2)
+    pairs = named_pairs(space.rig.joint_names)
     normal = _normal(space, pairs)
     counted = np.unique(space.joint_of_code[space.joint_of_code >= 0])
     across = space.origins @ normal
@@ -665,7 +665,7 @@ class RigMirror(PoseMirror):
         mirrored[:, :3, :3] @= np.swapaxes(sides.between, 1, 2)
         shapes = latent[self.space.are_shapes].copy()
         if self.space.rig.shapes is not None:
-            pairs = np.array(named_pairs(self.space.rig.shapes.names), dtype=np.intp).reshape(-1, 2)
+            pairs = named_pairs(self.space.rig.shapes.names)
             shapes[pairs] = shapes[pairs[:, ::-1]]
         codes = self.space.codes_of_transforms(mirrored @ self.space.rig.rest, shapes)
         joints = self.space.joint_of_code

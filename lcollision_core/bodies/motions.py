@@ -297,7 +297,7 @@ def read_motions(
         return [
             replace(
                 _with_weights(body, path, motion, fps),
-                contacts=_contacts(body, path, motion, retargeting, fps),
+                contacts=_contacts(path, motion, retargeting, fps),
             )
             for motion, retargeting in retargeted_motions(body, path, clip, fps)
         ]
@@ -340,7 +340,7 @@ def read_motions(
 
 
 def _contacts(
-    body: Body, path: Path, motion: Motion, retargeting: Retargeting, fps: float | None
+    path: Path, motion: Motion, retargeting: Retargeting, fps: float | None
 ) -> Callable[[], KeptContacts | None]:
     """Return a function that finds a retargeted motion's contacts, or None without a skin."""
 
@@ -350,7 +350,7 @@ def _contacts(
         if source is None:
             return None
         source_motion = _of_clip(source.character, source.space, motion.name, fps)
-        return contacts_of(body, motion, source, source_motion, retargeting)
+        return contacts_of(motion, source, source_motion, retargeting)
 
     return contacts
 
@@ -660,8 +660,8 @@ def write_clips(
     """
     if _is_bvh(path) or is_smpl_motion(file):
         return _write_own(path, body, file, changes)
-    character, space = character_of_motion(body, file), body.space
-    if character is None or not isinstance(space, RigPoseSpace):
+    character, space = character_of_motion(body, file), body.joints
+    if character is None or space is None:
         raise MeshFileError("has another rig", "name the file of the motion", where=file)
     require_written(path, character)
     written = _ClipsOfFile(as_gltf(character), space, body.exact_check(), file)

@@ -75,7 +75,7 @@ class JointMatch:
 
 
 @dataclass(frozen=True)
-class _Chosen:
+class _StoredMap:
     joints: dict[str, str | None]
 
 
@@ -204,7 +204,7 @@ def user_joint_map(motion: SkeletonMotion, space: RigPoseSpace, path: Path) -> J
     chosen_partners = space.rig.followed
     if not chosen_partners:
         try:
-            return read_followed(_path(motion.names, space.rig.joint_names)).joints
+            return read_followed(_path(motion.names, space.rig.joint_names))
         except (OSError, ModelFileError):
             return {}
     for kind, names_of_both, named in (
@@ -224,7 +224,7 @@ def user_joint_map(motion: SkeletonMotion, space: RigPoseSpace, path: Path) -> J
     return chosen_partners
 
 
-def read_followed(path: str | os.PathLike[str]) -> _Chosen:
+def read_followed(path: str | os.PathLike[str]) -> JointMap:
     """Read a JSON object "joints" that maps the body's joint names to the motion's.
 
     Raises
@@ -233,7 +233,7 @@ def read_followed(path: str | os.PathLike[str]) -> _Chosen:
     ModelFileError : it is damaged or cannot be read.
     """
     try:
-        return from_json(_Chosen, parse_json(read_regular(path, _MAX_BYTES)), "it")
+        return from_json(_StoredMap, parse_json(read_regular(path, _MAX_BYTES)), "it").joints
     except FileNotFoundError:
         raise
     except (OSError, ValueError) as error:
@@ -253,7 +253,7 @@ def with_joint_map(body: Body, file: str | os.PathLike[str]) -> RigBody:
         what = "isn't a rigged character, so --joints doesn't apply"
         raise LCollisionError(what, "name one rigged character", where=body.name)
     try:
-        chosen_partners = read_followed(file).joints
+        chosen_partners = read_followed(file)
     except FileNotFoundError as error:
         raise ModelFileError("there is no such file", "check the name", where=file) from error
     rig = replace(body.space.rig, followed=chosen_partners)

@@ -754,8 +754,8 @@ def rig_space_of(body: Body, path: Path) -> RigPoseSpace:
     ------
     MeshFileError : the body has no joints.
     """
-    if isinstance(body.space, RigPoseSpace):
-        return body.space
+    if body.joints is not None:
+        return body.joints
     raise MeshFileError(
         "is the motion of a skeleton, and the body has no joints",
         "name a rigged character as the body",

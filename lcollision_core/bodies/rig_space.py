@@ -550,13 +550,10 @@ class RigPoseSpace:
 
     def decode(self, codes: FloatArray) -> FloatArray:
         """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread."""
-        return self._skinned(codes, self._everyone)
+        return self.decode_some(codes, self._everyone)
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Turn (B, D) codes into (B, n, 3) chosen vertices, identical to those of `decode`."""
-        return self._skinned(codes, chosen)
-
-    def _skinned(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         poses = np.asarray(codes, dtype=np.float64)
         turns, shifts = self._turns_of_poses(poses)
         vertices = np.empty((len(poses), len(chosen), 3))
