@@ -155,6 +155,7 @@ class _Body:
         self.fingers = [
             joint for joint in sorted(turning) if space.roles[joint] in _FINGERS - {Role.PALM}
         ]
+        self._hand = _hands(space)
         self.of_fingers = space.codes_of_joints(np.array(self.fingers, dtype=np.int64))
         self.of_fingers[:ROOT_CODES] = False
 
@@ -192,14 +193,14 @@ class _Body:
         chain = [joint]
         while roles[parents[chain[-1]]] is roles[joint]:
             chain.append(int(parents[chain[-1]]))
-        number, first, palm = min(len(chain) - 1, 2), chain[-1], self._hand_of(joint)
+        number, first, palm = min(len(chain) - 1, 2), chain[-1], int(self._hand[joint])
         bone, axes = self._bones[joint][:, 1], self._bones[joint]
         firsts = [
             finger
             for finger in self.fingers
             if roles[finger] is Role.FINGER
             and roles[parents[finger]] is not Role.FINGER
-            and self._hand_of(finger) == palm
+            and self._hand[finger] == palm
         ]
         if roles[joint] is Role.THUMB:
             if not firsts:
@@ -226,18 +227,12 @@ class _Body:
             spread = hand.spread * float(offsets[firsts.index(joint)]) / (widest or 1.0)
         return np.array([curl, 0.0, spread])
 
-    def _hand_of(self, joint: int) -> int:
-        """Return the joint that the fingers of a hand are attached to."""
-        while joint >= 0 and self._space.roles[joint] in _FINGERS:
-            joint = int(self._space.rig.parents[joint])
-        return joint
-
     def _index_of(self, firsts: list[int], hand: int) -> int:
         """Return the finger nearest to the thumb, -1 without a thumb."""
         thumbs = [
             joint
             for joint in self.fingers
-            if self._space.roles[joint] is Role.THUMB and self._hand_of(joint) == hand
+            if self._space.roles[joint] is Role.THUMB and self._hand[joint] == hand
         ]
         if not thumbs:
             return -1
@@ -407,6 +402,15 @@ class _Body:
         return 1.0 if self._space.sides[joint] is Side.LEFT else -1.0
 
 
+def _hands(space: RigPoseSpace) -> npt.NDArray[np.int64]:
+    """Return the joint that carries the fingers of each joint of one, else the joint itself: (J,)."""
+    hands = np.arange(space.n_joints)
+    for joint, parent in enumerate(space.rig.parents):
+        if parent >= 0 and space.roles[joint] in _FINGERS:
+            hands[joint] = hands[parent]
+    return hands
+
+
 def _turn(left: float, up: float, front: float) -> FloatArray:
     """Return the rotation by degrees about one of left, up and front."""
     return from_rotation_vectors(np.radians([left, up, front]))
@@ -469,16 +473,6 @@ class HumanDraws:
             if alike and roles[joint] in _SHARED | _FINGERS:
                 chain[joint] = chain[parent]
         return chain
-
-    @cached_property
-    def _hand(self) -> npt.NDArray[np.int64]:
-        """(J,) the joint that a finger joint's fingers are attached to, else the joint itself."""
-        hand = np.arange(self.space.n_joints)
-        roles, parents = self.space.roles, self.space.rig.parents
-        for joint, parent in enumerate(parents):
-            if parent >= 0 and roles[joint] in _FINGERS:
-                hand[joint] = hand[parent]
-        return hand
 
     @cached_property
     def _limb(self) -> npt.NDArray[np.int64]:
@@ -565,7 +559,7 @@ class HumanDraws:
         place = generator.random((n, space.n_joints, 3))
         place = place[:, self._chain]
         fingers = np.flatnonzero([role in _FINGERS for role in space.roles])
-        curl = generator.random((n, space.n_joints))[:, self._hand[fingers]]
+        curl = generator.random((n, space.n_joints))[:, _hands(space)[fingers]]
         place[:, fingers, 0] += (1.0 - _CURL_SPREAD) * (curl - place[:, fingers, 0])
         low, high = self.limits[:, :, 0], self.limits[:, :, 1]
         turns = low + place * (high - low)
