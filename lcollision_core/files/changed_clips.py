@@ -13,7 +13,7 @@ import scipy
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.character import Character, CharacterFile, Rig
 from lcollision_core.files.gltf.clips import ClipTracks, Track, driven_property
-from lcollision_core.files.gltf.schema import PARTS, GltfDocument, stored_parts
+from lcollision_core.files.gltf.schema import GltfDocument, set_parts, stored_parts
 from lcollision_core.files.scene.scene import by_node
 from lcollision_core.files.scene.transforms import are_regular, unit_quaternions
 from lcollision_core.files.scene_files import as_file_error
@@ -179,6 +179,4 @@ def _put(patch: GltfDocument, animation: dict[str, Any], node: int, track: Track
     # Animated nodes must not have a matrix.
     moved = patch.description["nodes"][node]
     if "matrix" in moved:
-        parts = dict(zip(PARTS, stored_parts(moved), strict=True))
-        del moved["matrix"]
-        moved |= {name: part.tolist() for name, part in parts.items()}
+        set_parts(moved, stored_parts(moved))

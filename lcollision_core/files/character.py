@@ -12,7 +12,7 @@ import numpy.typing as npt
 import scipy
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.files.gltf.schema import PARTS, GltfDocument, as_float, local_transform
+from lcollision_core.files.gltf.schema import GltfDocument, as_float, local_transform, set_parts
 from lcollision_core.files.motion.smpl import SmplModel
 from lcollision_core.files.scene.appearance import Appearance
 from lcollision_core.files.scene.joined import JoinedMesh, look_of
@@ -71,9 +71,7 @@ class CharacterFile:
             above = rest[parent] if parent >= 0 else IDENTITY
             if is_regular(above):
                 node = document.description["nodes"][number]
-                node.pop("matrix", None)
-                local = decompose(np.linalg.solve(above, rest[number]))
-                node |= {name: part.tolist() for name, part in zip(PARTS, local, strict=True)}
+                set_parts(node, decompose(np.linalg.solve(above, rest[number])))
         return document
 
     @cached_property

@@ -30,7 +30,7 @@ from lcollision_core.files.character import (
 from lcollision_core.files.character_reading import character_of
 from lcollision_core.files.formats import GLTF_SUFFIXES
 from lcollision_core.files.gltf.read import read_shown
-from lcollision_core.files.gltf.schema import PARTS, VERTEX_DATA, GltfDocument, stored_parts
+from lcollision_core.files.gltf.schema import PARTS, GltfDocument, set_parts, stored_parts
 from lcollision_core.files.mesh.polygons import MAX_FILE_BYTES
 from lcollision_core.files.safe import make_unique, read_regular, write_bytes
 from lcollision_core.files.scene.joined import join_parts
@@ -539,9 +539,9 @@ class _Source:
                 if part == "rotation":
                     values *= signs_on_one_side(values)[:, None]
                 self.patch.add_channel(animation, times, number, part, values)
-            if node.pop("matrix", None) is not None:
+            if "matrix" in node:
                 # Animated nodes must not have a matrix.
-                node |= {part: track[0].tolist() for part, track in zip(PARTS, tracks, strict=True)}
+                set_parts(node, [track[0] for track in tracks])
         for number, values in self._reweighed(weights).items():
             self.patch.add_channel(animation, times, number, "weights", values.reshape(-1, 1))
         still = [number for number in rig.nodes.tolist() if "matrix" not in self._nodes[number]]
@@ -602,9 +602,9 @@ class _Source:
                 continue
             primitive = self._own_mesh(shown_part)["primitives"][shown_part.primitive]
             attributes = primitive["attributes"]
-            attributes["POSITION"] = self._vectors(stored[joined], has_bounds=True)
+            attributes["POSITION"] = self.patch.add_vertex_data(stored[joined], has_bounds=True)
             if "NORMAL" in attributes:
-                attributes["NORMAL"] = self._vectors(normals[rows])
+                attributes["NORMAL"] = self.patch.add_vertex_data(normals[rows])
             # Readers compute tangents from the normals and UVs.
             for name in [name for name in attributes if name.startswith(("JOINTS_", "WEIGHTS_"))]:
                 del attributes[name]
@@ -668,11 +668,11 @@ class _Source:
             stored[self._joined[rows]] = moved + turns[:, :, 3]
             mesh = self._file.editable.description["meshes"][shown_part.mesh]
             primitive = self._own_mesh(shown_part)["primitives"][shown_part.primitive]
-            target = {"POSITION": self._vectors(deltas, has_bounds=True)}
+            target = {"POSITION": self.patch.add_vertex_data(deltas, has_bounds=True)}
             if own_normals is not None:
                 # Readers transform normals by the inverse transpose.
                 turned = np.einsum("vij,vi->vj", turns[:, :, :3], normals[rows])
-                target["NORMAL"] = self._vectors(unit(turned) - own_normals)
+                target["NORMAL"] = self.patch.add_vertex_data(unit(turned) - own_normals)
             most = max(len(primitive.get("targets", ())) for primitive in mesh["primitives"])
             self._fill_targets(primitive, most)
             primitive["targets"].append(target)
@@ -702,7 +702,9 @@ class _Source:
         position = primitive["attributes"].get("POSITION")
         while position is not None and len(primitive.setdefault("targets", [])) < n_targets:
             zeros = np.zeros((self.patch.description["accessors"][position]["count"], 3))
-            primitive["targets"].append({"POSITION": self._vectors(zeros, has_bounds=True)})
+            primitive["targets"].append(
+                {"POSITION": self.patch.add_vertex_data(zeros, has_bounds=True)}
+            )
 
     def drop_clips(self) -> list[str]:
         """Remove the animations that move the character, and return their names."""
@@ -766,9 +768,6 @@ class _Source:
             return all("node" in target and target["node"] not in shaping for target in targets)
 
         return [number for number, animation in enumerate(animations) if not shows_pose(animation)]
-
-    def _vectors(self, values: npt.NDArray[Any], *, has_bounds: bool = False) -> int:
-        return self.patch.add_array(values, has_bounds=has_bounds, target=VERTEX_DATA)
 
     def _own_mesh(self, shown: Primitive) -> dict[str, Any]:
         """Return the mesh of a node, copied first if other nodes show it too."""

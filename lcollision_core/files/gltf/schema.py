@@ -8,7 +8,7 @@ import hashlib
 import json
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy, deepcopy
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -24,7 +24,7 @@ from lcollision_core.files.scene.transforms import compose, decompose
 from lcollision_core.json_values import parse_json, quoted
 from lcollision_core.meshes.topology import FloatArray
 
-VERTEX_DATA, INDICES = 34962, 34963
+_VERTEX_DATA, INDICES = 34962, 34963
 """Targets of buffer views: for attributes of vertices, and for faces."""
 
 _GLB_MAGIC = b"glTF"
@@ -112,6 +112,12 @@ class GltfDocument:
         self.description = _parsed(text)
         # In an editable copy, the data in the order in which they are written.
         self._pieces: list[_Bytes] = []
+
+    @classmethod
+    def empty(cls, path: Path) -> GltfDocument:
+        """Return an editable document without content, for a file beside `path`."""
+        asset = {"asset": {"version": "2.0", "generator": "LCollision"}}
+        return cls(json.dumps(asset).encode(), path).editable()
 
     @property
     def has_skin(self) -> bool:
@@ -383,7 +389,7 @@ class GltfDocument:
         values : unsigned integers of 1, 2 or 4 bytes keep their type, all else is stored as
             float32; 16 numbers are a column-major matrix
         has_bounds : whether to store the minimum and maximum, as required for positions and times
-        target : `VERTEX_DATA` for attributes of vertices, `INDICES` for faces
+        target : `INDICES` for faces; see `add_vertex_data` for attributes of vertices
 
         Returns
         -------
@@ -404,6 +410,10 @@ class GltfDocument:
         accessors = self.description.setdefault("accessors", [])
         accessors.append(accessor)
         return len(accessors) - 1
+
+    def add_vertex_data(self, values: npt.NDArray[Any], *, has_bounds: bool = False) -> int:
+        """Add an attribute of vertices, (n, k): see `add_array`."""
+        return self.add_array(values, has_bounds=has_bounds, target=_VERTEX_DATA)
 
     def add_channel(
         self, animation: dict[str, Any], times: int, node: int, path: str, values: FloatArray
@@ -682,6 +692,12 @@ def stored_parts(
         for name, default in PARTS.items()
     )
     return moved, turned, scaled
+
+
+def set_parts(node: dict[str, Any], parts: Iterable[FloatArray]) -> None:
+    """Store a translation, rotation and scale in a node, in place of a matrix."""
+    node.pop("matrix", None)
+    node |= {name: part.tolist() for name, part in zip(PARTS, parts, strict=True)}
 
 
 def local_transform(node: dict[str, Any], where: str = "a node") -> FloatArray:

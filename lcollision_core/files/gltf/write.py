@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.files.gltf.schema import INDICES, PARTS, VERTEX_DATA, GltfDocument
+from lcollision_core.files.gltf.schema import INDICES, PARTS, GltfDocument
 from lcollision_core.files.scene.appearance import (
     Appearance,
     Material,
@@ -110,8 +109,7 @@ def gltf_of(scene: Scene, place: FloatArray, name: str, path: Path) -> MadeGltf:
 class _Maker:
     def __init__(self, scene: Scene, place: FloatArray, name: str, path: Path) -> None:
         self._scene, self._name = scene, name
-        asset = {"asset": {"version": "2.0", "generator": "LCollision"}}
-        self._file = GltfDocument(json.dumps(asset).encode(), path).editable()
+        self._file = GltfDocument.empty(path)
         self._parents = scene.parents.copy()
         self._notes: list[str] = []
         self._hung: list[str] = []
@@ -227,16 +225,16 @@ class _Maker:
             # Readers flip them.
             faces = faces[:, [0, 2, 1]]
         attributes = {
-            "POSITION": self._vectors(
+            "POSITION": self._file.add_vertex_data(
                 part.points[look.vertices] @ turn[:3, :3].T + turn[:3, 3], has_bounds=True
             )
         }
         if look.normals is not None:
             normals = unit(look.normals @ np.linalg.pinv(turn[:3, :3]))
             normals[~normals.any(axis=1), 1] = 1.0
-            attributes["NORMAL"] = self._vectors(normals)
+            attributes["NORMAL"] = self._file.add_vertex_data(normals)
         if look.uv.any():
-            attributes["TEXCOORD_0"] = self._vectors(look.uv)
+            attributes["TEXCOORD_0"] = self._file.add_vertex_data(look.uv)
         if part.is_skinned:
             attributes |= self._influences(part, look.vertices)
             inverse = self._file.add_array(bind.transpose(0, 2, 1).reshape(-1, 16))
@@ -244,7 +242,11 @@ class _Maker:
             skins.append({"joints": bones.tolist(), "inverseBindMatrices": inverse})
             node["skin"] = len(skins) - 1
         targets = [
-            {"POSITION": self._vectors(morph[look.vertices] @ turn[:3, :3].T, has_bounds=True)}
+            {
+                "POSITION": self._file.add_vertex_data(
+                    morph[look.vertices] @ turn[:3, :3].T, has_bounds=True
+                )
+            }
             for morph in part.morphs
         ]
         mesh: dict[str, Any] = {
@@ -279,7 +281,7 @@ class _Maker:
             if (colours[kind_faces] != colour).any():
                 colour = np.ones(4)
                 if colour_accessor is None:
-                    colour_accessor = self._vectors(colours)
+                    colour_accessor = self._file.add_vertex_data(colours)
                 kind_attributes["COLOR_0"] = colour_accessor
             name = part.materials[named] if 0 <= named < len(part.materials) else ""
             primitive: dict[str, Any] = {"attributes": kind_attributes, "indices": indices}
@@ -302,8 +304,10 @@ class _Maker:
         for first in range(0, width, 4):
             columns = slice(first, first + 4)
             numbers = joints[vertices, columns].astype(np.uint16)
-            accessors[f"JOINTS_{first // 4}"] = self._vectors(numbers)
-            accessors[f"WEIGHTS_{first // 4}"] = self._vectors(weights[vertices, columns])
+            accessors[f"JOINTS_{first // 4}"] = self._file.add_vertex_data(numbers)
+            accessors[f"WEIGHTS_{first // 4}"] = self._file.add_vertex_data(
+                weights[vertices, columns]
+            )
         return accessors
 
     def _material(self, name: str, material: Material, colour: FloatArray) -> int:
@@ -359,9 +363,6 @@ class _Maker:
             # A clip needs at least one channel.
             add(0, "translation", self._tracks[0][number][0])
         return animation
-
-    def _vectors(self, values: npt.NDArray[Any], *, has_bounds: bool = False) -> int:
-        return self._file.add_array(values, has_bounds=has_bounds, target=VERTEX_DATA)
 
 
 def _look(part: Part) -> Appearance:

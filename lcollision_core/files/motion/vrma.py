@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -91,8 +90,7 @@ def vrma_bytes(
     ------
     MeshFileError : the file would be too large.
     """
-    asset = {"asset": {"version": "2.0", "generator": "LCollision"}}
-    file = GltfDocument(json.dumps(asset).encode(), Path()).editable()
+    file = GltfDocument.empty(Path())
     nodes: list[dict[str, Any]] = [
         {"name": name, "translation": offset.tolist()}
         for name, offset in zip(names, offsets, strict=True)
