@@ -64,9 +64,7 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
     named = [role_of_word(name) for name in rig.joint_names]
     parts = part_names(rig.joint_names)
     for joint, role in enumerate(named):
-        above = rig.parents[joint]
-        while above >= 0 and named[above] is Role.TWIST:
-            above = rig.parents[above]
+        above = _untwisted_parent(rig, joint, named)
         bone = named[above] if above >= 0 else None
         if bone is Role.SHOULDER and role is Role.FOREARM:
             named[above] = Role.UPPER_ARM
@@ -79,9 +77,7 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
     in_hand: list[bool] = []
     for joint, (role, parent) in enumerate(zip(named, rig.parents, strict=True)):
         in_hand.append(role is Role.HAND or bool(parent >= 0 and in_hand[parent]))
-        above = parent
-        while above >= 0 and roles[above] is Role.TWIST:
-            above = rig.parents[above]
+        above = _untwisted_parent(rig, joint, roles)
         bone = roles[above] if above >= 0 else None
         if repeats[joint]:
             role = roles[parent]
@@ -102,6 +98,14 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
             role = Role.FACE
         roles.append(role)
     return tuple(roles)
+
+
+def _untwisted_parent(rig: Rig, joint: int, roles: Sequence[Role]) -> int:
+    """Return a joint's nearest ancestor that is no twist, -1 for none."""
+    above = int(rig.parents[joint])
+    while above >= 0 and roles[above] is Role.TWIST:
+        above = int(rig.parents[above])
+    return above
 
 
 def plain_name(name: str) -> str:
@@ -160,9 +164,7 @@ def limb_children(rig: Rig, roles: Sequence[Role]) -> dict[int, int]:
     """Return the joint at the far end of each thigh, shin, upper arm and forearm."""
     next_joint: dict[int, int] = {}
     for joint, role in enumerate(roles):
-        above = int(rig.parents[joint])
-        while above >= 0 and roles[above] is Role.TWIST:
-            above = int(rig.parents[above])
+        above = _untwisted_parent(rig, joint, roles)
         if above >= 0 and _BONES.get(roles[above]) is role:
             next_joint.setdefault(above, joint)
     return next_joint

@@ -415,7 +415,7 @@ class SourceFile:
         vertices: npt.NDArray[Any],
         latents: Sequence[npt.NDArray[Any]],
         request: ExportRequest,
-    ) -> list[tuple[npt.NDArray[Any], tuple[str, ...]]]:
+    ) -> tuple[list[npt.NDArray[Any]], tuple[str, ...]]:
         """Write the poses of a rig as a clip in its file's form, atomically.
 
         Parameters
@@ -427,7 +427,8 @@ class SourceFile:
 
         Returns
         -------
-        for each pose, the results of `write`
+        stored : for each pose, the (V, 3) array as readers of the file get it
+        notes : sentences about what was left out
 
         Raises
         ------
@@ -443,7 +444,7 @@ class SourceFile:
             self._body.rules,
             keep_clips=request.keep_clips,
         )
-        return [(frame, (*made.notes, *notes)) for frame in stored]
+        return stored, (*made.notes, *notes)
 
     def write_motions(
         self, path: str | os.PathLike[str], motions: Sequence[Motion]
@@ -696,9 +697,9 @@ def write_sequence(
         frames = np.stack(
             [as_stored(path, file_frame.apply(pose), body.topology) for pose in vertices]
         )
-        clip = source.write_clip(path, frames, latents, request)
+        clip, notes = source.write_clip(path, frames, latents, request)
         unit = 1.0 / file_frame.scale
-        return list(files), [WrittenPose(Path(path), stored, unit, notes) for stored, notes in clip]
+        return list(files), [WrittenPose(Path(path), stored, unit, notes) for stored in clip]
     frame = export_frame(body, request.axes, path, request.scale)
     with ExitStack() as stack:
         # Several files are written together.

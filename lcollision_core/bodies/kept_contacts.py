@@ -336,9 +336,7 @@ def contacts_of(
         return vertices
 
     ground_of = list[float]()
-    for name, patch, on_ground, still in _soles(
-        source, both, np.array(heights), np.array(level), frames.rate
-    ):
+    for name, patch, on_ground, still in _soles(source, both, np.array(heights), np.array(level)):
         corners = np.unique(own_space.topology.faces[patch])
         for run in runs(on_ground):
             anchors = dict[int, FloatArray | None]()
@@ -401,14 +399,13 @@ def _sliding(
 
 
 def _soles(
-    source: RigBody, both: Correspondence, heights: FloatArray, level: FloatArray, rate: float
+    source: RigBody, both: Correspondence, heights: FloatArray, level: FloatArray
 ) -> Iterator[tuple[str, npt.NDArray[np.intp], npt.NDArray[np.bool_], npt.NDArray[np.bool_]]]:
     """Divide surfaces that touch the ground into patches.
 
     Parameters
     ----------
     heights, level : (T, V) heights and (T, V, 3) horizontal positions of the source's vertices
-    rate : frame rate
 
     Yields
     ------
@@ -416,7 +413,7 @@ def _soles(
     patch : of the body
     on_ground, still : (T,) when it is on the ground, and when it stays in place
     """
-    space = both.source
+    space, slowest = both.source, _STANDING / both.source_motion.rate
     low = heights < heights.min() + _TOUCHING
     rest, domain = space.rest_vertices, space.vertex_domain
     for part in np.unique(domain[low.any(axis=0)]).tolist():
@@ -434,7 +431,7 @@ def _soles(
             limb = int(both.limbs[images[0]])
             on_ground = low[:, inside].any(axis=1)
             means = level[:, inside].mean(axis=1)
-            step = np.linalg.norm(np.diff(means, axis=0), axis=1) < _STANDING / rate
+            step = np.linalg.norm(np.diff(means, axis=0), axis=1) < slowest
             still = np.zeros(len(low), dtype=np.bool_)
             still[1:] |= step & on_ground[1:] & on_ground[:-1]
             still[:-1] |= step & on_ground[1:] & on_ground[:-1]

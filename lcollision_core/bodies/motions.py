@@ -113,7 +113,7 @@ def body_of_smpl(body: Body, path: Path) -> tuple[RigBody, tuple[str, ...]]:
     ------
     MeshFileError : the body is not of a body model; also see `read_smpl_motion`.
     """
-    rigged, motion = _read(body, path)
+    rigged, motion = _body_and_motion_of_smpl(body, path)
     model = rigged.character.smpl
     assert model is not None
     notes = list(motion.notes)
@@ -127,7 +127,7 @@ def body_of_smpl(body: Body, path: Path) -> tuple[RigBody, tuple[str, ...]]:
     if motion.betas[n_shapes:].any():
         notes.append(f"only the first {n_shapes} of its betas are in the body model")
     notes += _misfits(rigged, motion)
-    shaped = _shaped(rigged, motion)
+    shaped = _in_its_shape(rigged, motion)
     same = rigged if shaped is None else RigBody.of(shaped).with_choices_of(rigged)
     return same, tuple(notes)
 
@@ -160,8 +160,8 @@ def motion_of_smpl(body: Body, path: Path, fps: float | None = None) -> Motion:
     ------
     MeshFileError : the body is not of a body model or has another shape; see `read_smpl_motion`.
     """
-    rigged, motion = _read(body, path)
-    if _shaped(rigged, motion) is not None:
+    rigged, motion = _body_and_motion_of_smpl(body, path)
+    if _in_its_shape(rigged, motion) is not None:
         raise MeshFileError(
             "is of another shape ('betas') than the body, or turns other joints",
             "open the body in the shape of the motion",
@@ -169,7 +169,7 @@ def motion_of_smpl(body: Body, path: Path, fps: float | None = None) -> Motion:
         )
     space, frame = rigged.space, axes_of_smpl(motion)
     turns = np.zeros((len(motion), space.n_joints, 3))
-    for joint, number in _pairs(space, motion):
+    for joint, number in _shared_joints(space, motion):
         turns[:, joint] = motion.turns[:, number]
     turns[:, 0] = _turned_by(frame, turns[:, 0])
     pelvis = space.rig.rest[0, :3, 3]
@@ -197,14 +197,14 @@ def write_smpl(
     ------
     MeshFileError : the motion's file cannot be read, or the output cannot be written.
     """
-    rigged, motion = _read(body, file)
+    rigged, motion = _body_and_motion_of_smpl(body, file)
     space, frame = rigged.space, axes_of_smpl(motion)
     turns, places = motion.turns[list(frames)], motion.places[list(frames)]
     pelvis = space.rig.rest[0, :3, 3]
     for row, pose in enumerate(codes):
         own_turns, shift = space.rotations_of(pose)
         own_turns[0] = _turned_by(frame.T, own_turns[0])
-        for joint, number in _pairs(space, motion):
+        for joint, number in _shared_joints(space, motion):
             turns[row, number] = own_turns[joint]
         places[row] = (pelvis + shift) @ frame - pelvis
     with atomic_write(path) as out:
@@ -218,7 +218,8 @@ def _turned_by(frame: FloatArray, turns: FloatArray) -> FloatArray:
     return turned
 
 
-def _read(body: Body, path: Path) -> tuple[RigBody, SmplMotion]:
+def _body_and_motion_of_smpl(body: Body, path: Path) -> tuple[RigBody, SmplMotion]:
+    """Return a body of a body model, and the motion in a file; refuse any other body."""
     model = None if body.character is None else body.character.smpl
     if model is None or not isinstance(body, RigBody):
         raise MeshFileError(
@@ -229,7 +230,7 @@ def _read(body: Body, path: Path) -> tuple[RigBody, SmplMotion]:
     return body, read_smpl_motion(path, model.hands)
 
 
-def _shaped(body: RigBody, motion: SmplMotion) -> Character | None:
+def _in_its_shape(body: RigBody, motion: SmplMotion) -> Character | None:
     """Return a body model in the shape of a motion, None if the body already has it."""
     character = body.character
     assert character.smpl is not None
@@ -243,7 +244,7 @@ def _shaped(body: RigBody, motion: SmplMotion) -> Character | None:
     return replace(shaped, rig=shaped_rig, up=character.up, up_is_sure=character.up_is_sure)
 
 
-def _pairs(space: RigPoseSpace, motion: SmplMotion) -> list[tuple[int, int]]:
+def _shared_joints(space: RigPoseSpace, motion: SmplMotion) -> list[tuple[int, int]]:
     """Return index pairs of the joints that body and motion share."""
     numbers = {name: number for number, name in enumerate(motion.names)}
     names = enumerate(space.rig.joint_names)

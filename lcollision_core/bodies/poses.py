@@ -587,7 +587,6 @@ class PoseLibrary:
     def __init__(self, model: Body, folder: Path, tell: Callable[[LCollisionError], None]) -> None:
         self._model = model
         self._tell = tell
-        self._folder = folder
         self._file = LibraryFile(_path(model, folder))
         self._unwritten: tuple[LibraryChange, ...] = ()
         self._poses: tuple[NamedPose, ...] = ()
@@ -623,7 +622,7 @@ class PoseLibrary:
 
         It raises ModelFileError if the file cannot be written. Only one may run at a time.
         """
-        return partial(_write, self._model, self._folder, self._file, self._unwritten)
+        return partial(_write, self._model, self._file, self._unwritten)
 
     def take(self, written: LibraryWrite) -> None:
         """Take over the result of a write, including changes by other programs."""
@@ -638,7 +637,7 @@ class PoseLibrary:
 
     def refresh(self) -> bool:
         """Load changes by other programs; return whether there were any."""
-        file = _found(self._model, self._folder, self._file)
+        file = _at_current_path(self._model, self._file)
         stamp = file_stamp(file.path)
         if stamp is None or stamp in (file.stamp, self._refused):
             return False
@@ -657,9 +656,9 @@ class PoseLibrary:
             self._tell(file.damage)
 
 
-def _found(model: Body, folder: Path, file: LibraryFile) -> LibraryFile:
+def _at_current_path(model: Body, file: LibraryFile) -> LibraryFile:
     """Adopt a library file made under another name of the same model."""
-    return file if file.path.exists() else replace(file, path=_path(model, folder))
+    return file if file.path.exists() else replace(file, path=_path(model, file.path.parent))
 
 
 def _read(model: Body, file: LibraryFile) -> LibraryFile:
@@ -679,11 +678,9 @@ def _read(model: Body, file: LibraryFile) -> LibraryFile:
         return replace(file, damage=ModelFileError(what, next_step, where="your pose library"))
 
 
-def _write(
-    model: Body, folder: Path, file: LibraryFile, changes: Sequence[LibraryChange]
-) -> LibraryWrite:
+def _write(model: Body, file: LibraryFile, changes: Sequence[LibraryChange]) -> LibraryWrite:
     """Apply changes to the current file, under its lock."""
-    file = _found(model, folder, file)
+    file = _at_current_path(model, file)
     try:
         file.path.parent.mkdir(parents=True, exist_ok=True)
         with locked(file.path, _LOCK_SECONDS):

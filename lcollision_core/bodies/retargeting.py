@@ -123,7 +123,7 @@ class Retargeting:
         same = _as_the_rig(stored, space)
         motion = same or with_standing_rest(stored)
         rest, rig = rest_places(motion), space.rig
-        figure, anatomy, partner, _ = _followed(motion, rest, space, path)
+        figure, anatomy, partner, _ = _matched(motion, rest, space, path)
         if len(followed_limbs(partner, space)) < LEAST_JOINTS:
             raise other
         axes = space.body_axes @ axes_of(motion.up, anatomy.front).T
@@ -259,7 +259,7 @@ class Retargeting:
         return self.motion.axes is None and nearer > _NEARLY * leg
 
 
-def _followed(
+def _matched(
     motion: ReposedMotion, rest: FloatArray, space: RigPoseSpace, path: Path
 ) -> tuple[Character, Anatomy, npt.NDArray[np.int64], frozenset[str]]:
     """Return a skeleton's figure, its anatomy, each rig joint's partner, and unsure joints.
@@ -293,11 +293,11 @@ def joint_match(body: Body, path: Path) -> JointMatch | None:
     """
     if not isinstance(body, RigBody):
         return None
-    motion = _read(path, most=_MOST_LOOKED_AT)[0]
+    motion = _skeleton_motions(path, most=_MOST_LOOKED_AT)[0]
     if len(motion.names) < LEAST_JOINTS:
         return None
     rested = with_standing_rest(motion)
-    *_, partner, unsure = _followed(rested, rest_places(rested), body.space, path)
+    *_, partner, unsure = _matched(rested, rest_places(rested), body.space, path)
     return match_of(partner, unsure, motion.names, body)
 
 
@@ -686,7 +686,7 @@ def retargeted_motions(
     """
     space = rig_space_of(body, path)
     motions = []
-    for motion in _read(path, clip, fps):
+    for motion in _skeleton_motions(path, clip, fps):
         times = motion.times
         if fps is not None and (path.suffix.lower() == BVH_SUFFIX or is_generated(path)):
             times = np.arange(len(times), dtype=np.float64) / fps
@@ -706,7 +706,7 @@ def skeleton_notes(body: Body, path: Path) -> tuple[str, ...]:
     ------
     MeshFileError : the file is damaged, or the body has no matching skeleton.
     """
-    motion = _read(path, most=_MOST_LOOKED_AT)[0]
+    motion = _skeleton_motions(path, most=_MOST_LOOKED_AT)[0]
     notes, rested = motion.notes, Retargeting.of(motion, rig_space_of(body, path), path).motion
     if rested.turns_y_up:
         return (*notes, f"{path.name} stands along y at rest and along z in its frames: z is up")
@@ -730,7 +730,7 @@ _MOST_LOOKED_AT = 64
 """Most frames of a clip that are read to find its rest pose."""
 
 
-def _read(
+def _skeleton_motions(
     path: Path, clip: str | None = None, fps: float | None = None, most: int | None = None
 ) -> list[SkeletonMotion]:
     """Read a moving skeleton; `most` limits the frames read of each clip of a scene."""

@@ -403,7 +403,7 @@ class _Body:
 
 
 def _hands(space: RigPoseSpace) -> npt.NDArray[np.int64]:
-    """Return the joint that carries the fingers of each joint of one, else the joint itself: (J,)."""
+    """Return the joint that a finger joint's hand hangs on, itself for other joints: (J,)."""
     hands = np.arange(space.n_joints)
     for joint, parent in enumerate(space.rig.parents):
         if parent >= 0 and space.roles[joint] in _FINGERS:

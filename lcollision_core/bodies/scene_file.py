@@ -82,11 +82,12 @@ def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
         raise ModelFileError.unreadable(target, "there is no such file", "name a scene") from error
     except (OSError, ValueError) as error:
         raise ModelFileError.unreadable(target, error, "save the scene again") from error
-    parts = tuple(replace(part, file=_found(part, target)) for part in scene.bodies)
+    parts = tuple(replace(part, file=_path_of_part(part, target)) for part in scene.bodies)
     return replace(scene, bodies=parts, path=str(target))
 
 
-def _found(part: ScenePart, scene: Path) -> str:
+def _path_of_part(part: ScenePart, scene: Path) -> str:
+    """Return the path of a body's file, or a model's name."""
     given = Path(part.file)
     if len(given.parts) == 1 and not given.suffix:
         return part.file
@@ -164,7 +165,7 @@ def body_of_scene(
         place = _place(part, body, first)
         member = SceneMember(name, body, place, part.fixed)
         if part.held_by:
-            member = _held(member, part, members, bring=not as_posed)
+            member = _in_hand(member, part, members, bring=not as_posed)
         members.append(member)
     if scene.ground is not None:
         members.append(_ground(scene.ground, members))
@@ -211,7 +212,7 @@ def _place(part: ScenePart, body: Body, first: Body) -> RigidTransform:
     return RigidTransform(about @ turn, np.array(part.at, dtype=np.float64), scale)
 
 
-def _held(
+def _in_hand(
     member: SceneMember, part: ScenePart, members: Sequence[SceneMember], *, bring: bool
 ) -> SceneMember:
     """Return a held body, moved to the joint that holds it unless already near it."""

@@ -467,10 +467,10 @@ def _shapes(scene: Scene, mesh: JoinedMesh, weights: FloatArray) -> Shapes | Non
 
 
 def _points(
-    scene: Scene, mesh: JoinedMesh, held: FloatArray, weights: tuple[FloatArray, ...]
+    scene: Scene, mesh: JoinedMesh, transforms: FloatArray, weights: tuple[FloatArray, ...]
 ) -> FloatArray:
     """Return `Rig.points`, (V, I, 3), with (B, 4, 4) transforms of the bones and morph weights."""
-    turns = (held @ mesh.bind)[mesh.bone_of]
+    turns = (transforms @ mesh.bind)[mesh.bone_of]
     points: FloatArray = np.einsum("vijk,vk->vij", turns[..., :3, :3], mesh.morphed(weights))
     points += turns[..., :3, 3]
     if mesh.dual.any():

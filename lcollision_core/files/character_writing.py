@@ -478,7 +478,7 @@ class _Source:
 
         def hold(number: int, local: FloatArray) -> FloatArray:
             node = self._nodes[number]
-            kept = _held(node, local)
+            kept = _parts_to_store(node, local)
             for name, stored, new in zip(PARTS, stored_parts(node), kept, strict=True):
                 if "matrix" in node or not np.array_equal(stored, new):
                     node[name] = new.tolist()
@@ -519,7 +519,7 @@ class _Source:
                     keys[number] = [
                         np.tile(part, (len(transforms), 1)) for part in stored_parts(node)
                     ]
-                kept = _held(node, local)
+                kept = _parts_to_store(node, local)
                 for key, part in zip(keys[number], kept, strict=True):
                     key[frame] = part
                 return compose(*kept)
@@ -821,7 +821,9 @@ def _relative(above: FloatArray, transform: FloatArray) -> FloatArray:
         raise UnwritablePoseError("a joint's parent has zero scale", _OTHER_FORM) from error
 
 
-def _held(node: dict[str, Any], local: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _parts_to_store(
+    node: dict[str, Any], local: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the translation, rotation and scale that a file stores for a local transform.
 
     An unchanged translation or scale, as of a joint that only turns, is that of the node.

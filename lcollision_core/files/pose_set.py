@@ -259,15 +259,15 @@ class PoseSet:
         return self.topology.faces
 
 
-def disagreement(where: str, found: Topology, expected: Topology) -> PoseSetError | None:
+def disagreement(where: str, given: Topology, expected: Topology) -> PoseSetError | None:
     """Return the error for a mesh whose topology differs from its set's, None if it is equal."""
-    if found.n_vertices != expected.n_vertices:
-        what, needed, got = "number of vertices", expected.n_vertices, found.n_vertices
-    elif found.n_faces != expected.n_faces:
-        what, needed, got = "number of faces", expected.n_faces, found.n_faces
-    elif different := np.flatnonzero((found.faces != expected.faces).any(axis=1)).tolist():
+    if given.n_vertices != expected.n_vertices:
+        what, needed, got = "number of vertices", expected.n_vertices, given.n_vertices
+    elif given.n_faces != expected.n_faces:
+        what, needed, got = "number of faces", expected.n_faces, given.n_faces
+    elif different := np.flatnonzero((given.faces != expected.faces).any(axis=1)).tolist():
         face = different[0]
-        needed, got = (topology.faces[face].tolist() for topology in (expected, found))
+        needed, got = (topology.faces[face].tolist() for topology in (expected, given))
         what = f"face {face}"
     else:
         return None

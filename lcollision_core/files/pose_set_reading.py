@@ -371,12 +371,12 @@ def _usable(
 
 
 def _meshes_of(
-    arrays: dict[str, npt.NDArray[Any]], held: Sequence[str]
+    arrays: dict[str, npt.NDArray[Any]], names: Sequence[str]
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     meshes = []
     for name, short_name in _MESH_ARRAYS:
         if name not in arrays:
-            others = listed(sorted(held))[:_MAX_TEXT_LENGTH]
+            others = listed(sorted(names))[:_MAX_TEXT_LENGTH]
             only = f", only {others}" if others else ""
             raise MeshFileError(f"it has no array {name!r} or {short_name!r}{only}")
         meshes.append(arrays[name])

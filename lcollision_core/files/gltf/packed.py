@@ -53,12 +53,12 @@ def unpack(document: GltfDocument) -> None:
                 _draco(document, primitive, compression, f"mesh {number}", unpacked)
 
 
-def _meshopt(document: GltfDocument, held: dict[str, Any], what: str) -> bytes:
-    count = require_int(held.get("count"), f"the count of {what}", 0, 3 * MAX_FACES)
+def _meshopt(document: GltfDocument, packed: dict[str, Any], what: str) -> bytes:
+    count = require_int(packed.get("count"), f"the count of {what}", 0, 3 * MAX_FACES)
     most = min(_MOST_STRIDE, MAX_FILE_BYTES // max(count, 1))
-    stride = require_int(held.get("byteStride"), f"the stride of {what}", 1, most)
-    data = bytes(document.bytes_of(held, what))
-    return decode(data, count, stride, str(held.get("mode")), str(held.get("filter", "NONE")))
+    stride = require_int(packed.get("byteStride"), f"the stride of {what}", 1, most)
+    data = bytes(document.bytes_of(packed, what))
+    return decode(data, count, stride, str(packed.get("mode")), str(packed.get("filter", "NONE")))
 
 
 def _has_data(document: GltfDocument, primitive: dict[str, Any]) -> bool:
@@ -75,7 +75,7 @@ def _has_data(document: GltfDocument, primitive: dict[str, Any]) -> bool:
 def _draco(
     document: GltfDocument,
     primitive: dict[str, Any],
-    held: dict[str, Any],
+    packed: dict[str, Any],
     where: str,
     unpacked: dict[int, Any],
 ) -> None:
@@ -85,12 +85,12 @@ def _draco(
     except ImportError as error:
         raise MissingExtraError(
             "its meshes are compressed by Draco, which needs the extra 'draco'",
-            "install lcollision[draco], or export it without compression",
+            "install lcollision[draco], or export it without packed",
             where=document.path,
         ) from error
     views, accessors = document.objects("bufferViews"), document.objects("accessors")
     number = require_int(
-        held.get("bufferView"), f"the compressed data of {where}", 0, len(views) - 1
+        packed.get("bufferView"), f"the compressed data of {where}", 0, len(views) - 1
     )
     if number not in unpacked:
         try:
@@ -101,7 +101,9 @@ def _draco(
             ) from error
     mesh = unpacked[number]
     stored = {one["unique_id"]: one["data"] for one in mesh.attributes}
-    decoded_attributes = {name: stored.get(own) for name, own in inner(held, "attributes").items()}
+    decoded_attributes = {
+        name: stored.get(own) for name, own in inner(packed, "attributes").items()
+    }
     decoded_attributes["indices"] = None if len(mesh.faces) == 0 else mesh.faces.reshape(-1, 1)
     for name, index in (*primitive["attributes"].items(), ("indices", primitive.get("indices"))):
         values = decoded_attributes.get(name)

@@ -324,10 +324,10 @@ def rewritten(data: bytes, vertices: npt.NDArray[Any]) -> bytes:
     return result
 
 
-def _moved_normals(held: ObjCorners, vertices: FloatArray) -> FloatArray:
-    sizes, position = held.sizes, np.arange(len(held.corners))
+def _moved_normals(obj: ObjCorners, vertices: FloatArray) -> FloatArray:
+    sizes, position = obj.sizes, np.arange(len(obj.corners))
     start, size = np.repeat(np.cumsum(sizes) - sizes, sizes), np.repeat(sizes, sizes)
-    beside = [held.corners[start + (position - start + step) % size] for step in (1, -1)]
-    corners = np.stack([held.corners, *beside], axis=1)[held.corner_normals >= 0]
-    owners = held.corner_normals[held.corner_normals >= 0]
-    return moved_normals(held.normals, owners, corners, held.vertices, vertices)
+    beside = [obj.corners[start + (position - start + step) % size] for step in (1, -1)]
+    corners = np.stack([obj.corners, *beside], axis=1)[obj.corner_normals >= 0]
+    owners = obj.corner_normals[obj.corner_normals >= 0]
+    return moved_normals(obj.normals, owners, corners, obj.vertices, vertices)

@@ -346,8 +346,8 @@ class _Array:
         return flat.reshape(shape, order="F" if is_fortran else "C")
 
 
-def _scalar(kind: _Type, held: bytes) -> Any:
-    return np.frombuffer(held, kind.plain())[0].item()
+def _scalar(kind: _Type, loaded: bytes) -> Any:
+    return np.frombuffer(loaded, kind.plain())[0].item()
 
 
 def _from_text(text: str, encoding: str) -> bytes:
@@ -392,13 +392,13 @@ def read_plain_pickle(data: bytes) -> Any:
         raise ValueError(str(error) or type(error).__name__) from error
 
 
-def _value(held: Any) -> Any:
-    if isinstance(held, _Array):
-        return held.value()
-    if isinstance(held, dict):
-        return {str(key): _value(item) for key, item in held.items()}
-    if isinstance(held, list | tuple):
-        return [_value(item) for item in held]
-    if held is None or isinstance(held, str | bytes | bool | int | float):
-        return held
-    raise pickle.UnpicklingError(f"it holds a {type(held).__name__}")
+def _value(loaded: Any) -> Any:
+    if isinstance(loaded, _Array):
+        return loaded.value()
+    if isinstance(loaded, dict):
+        return {str(key): _value(item) for key, item in loaded.items()}
+    if isinstance(loaded, list | tuple):
+        return [_value(item) for item in loaded]
+    if loaded is None or isinstance(loaded, str | bytes | bool | int | float):
+        return loaded
+    raise pickle.UnpicklingError(f"it holds a {type(loaded).__name__}")

@@ -94,7 +94,7 @@ class FbxLooks:
         self._ask, self._path = ask, path
 
     @cached_property
-    def _found(self) -> dict[str, Any]:
+    def _arrays(self) -> dict[str, Any]:
         return self._ask()
 
     @cached_property
@@ -102,12 +102,12 @@ class FbxLooks:
         """The materials of the file, the last without texture, and notes."""
         images, notes = ImageReader(), list[str]()
         textures: list[Texture | None] = []
-        for number, name in enumerate(self._found["textures"].tolist()):
+        for number, name in enumerate(self._arrays["textures"].tolist()):
             wraps = [
-                Wrap.CLAMP if clamps else Wrap.REPEAT for clamps in self._found["clamps"][number]
+                Wrap.CLAMP if clamps else Wrap.REPEAT for clamps in self._arrays["clamps"][number]
             ]
             try:
-                data = self._found[f"content {number}"].tobytes() or self._beside(name)
+                data = self._arrays[f"content {number}"].tobytes() or self._beside(name)
                 # FBX has v = 0 at the bottom.
                 pixels = images.read(data, f"the texture {quoted(name)}")
                 textures.append(Texture(pixels, (wraps[0], wraps[1]), file=data))
@@ -115,7 +115,7 @@ class FbxLooks:
                 textures.append(None)
                 notes.append(error.headline)
         material_textures = [
-            None if number < 0 else textures[number] for number in self._found["texture_of"]
+            None if number < 0 else textures[number] for number in self._arrays["texture_of"]
         ]
         return [Material(texture) for texture in [*material_textures, None]], notes
 
@@ -133,7 +133,7 @@ class FbxLooks:
 
     def appearance(self, laid: MeshFaces, *, shaded: bool = False) -> Appearance:
         """Read the appearance of a mesh; if `shaded`, with normals, which split points too."""
-        looks, (materials, notes) = self._found, self._materials
+        looks, (materials, notes) = self._arrays, self._materials
         faces = laid.faces_of_corners()
         prefix, n = f"{laid.number} ", len(laid.corners)
         uv = np.zeros((n, 2))
@@ -219,7 +219,7 @@ def read_shown(source: FbxDocument) -> Scene:
     shown_nodes = answer["shown"].tolist()
     numbers, parts = [], []
     for number, node in enumerate(shown_nodes):
-        part = _part(_only(answer, number), number, node, answer["transforms"], looks, notes)
+        part = _part(_of_mesh(answer, number), number, node, answer["transforms"], looks, notes)
         if part is not None:
             numbers.append(number)
             parts.append(part)
@@ -253,7 +253,7 @@ def read_nodes(source: FbxDocument) -> Scene:
     answer = source.request()
     skins = [
         (own["bones"][1:], own["bind"][1:])
-        for own in (_only(answer, number) for number in range(len(answer["shown"])))
+        for own in (_of_mesh(answer, number) for number in range(len(answer["shown"])))
     ]
     return Scene(
         tuple(answer["names"].tolist()),
@@ -267,9 +267,9 @@ def read_nodes(source: FbxDocument) -> Scene:
     )
 
 
-def _frame(held: dict[str, Any]) -> dict[str, Any]:
+def _frame(arrays: dict[str, Any]) -> dict[str, Any]:
     """Return `up` and `metres` of a scene."""
-    up, metres = int(held["up"]), float(held["metres"])
+    up, metres = int(arrays["up"]), float(arrays["metres"])
     return {
         "up": None if up == _UNKNOWN_AXIS else (1.0 - 2.0 * (up % 2)) * np.eye(3)[up // 2],
         "metres": metres if 0.0 < metres < np.inf else 0.01,
@@ -362,12 +362,12 @@ def _sample(
     return ScenePoses(answer["transforms"], weights)
 
 
-def _clips(source: FbxDocument, held: dict[str, Any], parts: tuple[int, ...]) -> list[Clip]:
-    names = make_unique([name or "clip" for name in held["clips"].tolist()])
+def _clips(source: FbxDocument, arrays: dict[str, Any], parts: tuple[int, ...]) -> list[Clip]:
+    names = make_unique([name or "clip" for name in arrays["clips"].tolist()])
     clips = []
-    for number, (name, (start, end)) in enumerate(zip(names, held["spans"], strict=True)):
-        key_times = partial(_frame_times, name, float(start), float(end), float(held["fps"]))
-        moved = frozenset(held[f"moved {number}"].tolist())
+    for number, (name, (start, end)) in enumerate(zip(names, arrays["spans"], strict=True)):
+        key_times = partial(_frame_times, name, float(start), float(end), float(arrays["fps"]))
+        moved = frozenset(arrays[f"moved {number}"].tolist())
         clips.append(Clip(name, moved, key_times, partial(_sample, source, number, parts)))
     return clips
 
@@ -398,14 +398,14 @@ def _frame_times(name: str, start: float, end: float, said: float) -> FloatArray
     return np.linspace(start, end, round(steps[best]) + 1)
 
 
-def _only(held: dict[str, Any], number: int) -> dict[str, Any]:
+def _of_mesh(arrays: dict[str, Any], number: int) -> dict[str, Any]:
     """Return the arrays of one mesh, without their prefix."""
     prefix = f"{number} "
-    return {name[len(prefix) :]: held[name] for name in held if name.startswith(prefix)}
+    return {name[len(prefix) :]: arrays[name] for name in arrays if name.startswith(prefix)}
 
 
 def _part(
-    held: dict[str, Any],
+    arrays: dict[str, Any],
     number: int,
     node: int,
     transforms: FloatArray,
@@ -413,33 +413,33 @@ def _part(
     notes: list[str],
 ) -> Part | None:
     """Return the part for a mesh shown by a node; None if it has no faces."""
-    sizes, is_face = held["faces"][:, 1], held["faces"][:, 1] >= 3
+    sizes, is_face = arrays["faces"][:, 1], arrays["faces"][:, 1] >= 3
     is_used = np.repeat(is_face, sizes)
-    corners = held["corners"][is_used]
-    points = held["points"]
+    corners = arrays["corners"][is_used]
+    points = arrays["points"]
     if not is_face.all():
         notes.append("edges and points without faces were left out")
     if not is_face.any():
         return None
     faces, cut_of, sentences = triangulate(Polygons(points, sizes[is_face], corners))
     notes += sentences
-    material_of = held["material_of"]
+    material_of = arrays["material_of"]
     if not len(material_of):
         material_of = np.zeros(len(sizes), dtype=np.int64)
-    bones, bind = held["bones"], held["bind"]
-    bone_of, weights = _influences(held, len(points))
+    bones, bind = arrays["bones"], arrays["bind"]
+    bone_of, weights = _influences(arrays, len(points))
     if len(bones) > 1 and bone_of[weights > 0.0].all():
         # No vertex follows the node itself, so drop it.
         bones, bind, bone_of = bones[1:], bind[1:], np.maximum(bone_of - 1, 0)
-    if int(held["skins"]) > 1:
+    if int(arrays["skins"]) > 1:
         notes.append("of the several skins of a mesh only the first was read")
     if is_mirrored(transforms[bones] @ bind, bone_of, weights):
         faces = faces[:, [0, 2, 1]]
     material_of = material_of[is_face][cut_of]
     laid = MeshFaces(number, is_used, corners, sizes[is_face], faces, cut_of, material_of)
     return Part(
-        str(held["name"]),
-        tuple(held["materials"].tolist()),
+        str(arrays["name"]),
+        tuple(arrays["materials"].tolist()),
         material_of,
         node,
         points,
@@ -448,21 +448,23 @@ def _part(
         bind,
         bone_of,
         weights,
-        is_skinned="shares" in held,
-        morphs=_morphs(held, len(points)),
-        sliders=_sliders(held),
-        dual=held.get("dual"),
+        is_skinned="shares" in arrays,
+        morphs=_morphs(arrays, len(points)),
+        sliders=_sliders(arrays),
+        dual=arrays.get("dual"),
         look=partial(looks.appearance, laid),
         shaded_look=partial(looks.appearance, laid, shaded=True),
         cut_of=cut_of,
     )
 
 
-def _influences(held: dict[str, Any], n_vertices: int) -> tuple[npt.NDArray[np.int32], FloatArray]:
+def _influences(
+    arrays: dict[str, Any], n_vertices: int
+) -> tuple[npt.NDArray[np.int32], FloatArray]:
     """Return the bones and weights of each vertex; unweighted ones follow the node, bone 0."""
-    if "shares" not in held:
+    if "shares" not in arrays:
         return np.zeros((n_vertices, 1), dtype=np.int32), np.ones((n_vertices, 1))
-    vertices, movers, shares = held["moved"], held["movers"], held["shares"]
+    vertices, movers, shares = arrays["moved"], arrays["movers"], arrays["shares"]
     used = (shares > 0.0) & np.isfinite(shares) & (vertices >= 0) & (vertices < n_vertices)
     vertices, movers, shares = vertices[used], movers[used], shares[used]
     order = np.argsort(vertices, kind="stable")
@@ -478,17 +480,17 @@ def _influences(held: dict[str, Any], n_vertices: int) -> tuple[npt.NDArray[np.i
     return bone_of, weights / weights.sum(axis=1, keepdims=True)
 
 
-def _sliders(held: dict[str, Any]) -> dict[str, FloatArray]:
+def _sliders(arrays: dict[str, Any]) -> dict[str, FloatArray]:
     """Return `Part.sliders`, one for each blend shape."""
-    names = [name or f"shape {n}" for n, name in enumerate(held["shapes"].tolist(), 1)]
+    names = [name or f"shape {n}" for n, name in enumerate(arrays["shapes"].tolist(), 1)]
     return dict(zip(make_unique(names), np.eye(len(names)), strict=True))
 
 
-def _morphs(held: dict[str, Any], n_vertices: int) -> npt.NDArray[np.float32]:
-    n_shapes = len(held["weights"])
+def _morphs(arrays: dict[str, Any], n_vertices: int) -> npt.NDArray[np.float32]:
+    n_shapes = len(arrays["weights"])
     morphs = np.zeros((n_shapes, n_vertices, 3), dtype=np.float32)
     for number in range(n_shapes):
-        changed, offsets = held[f"changed {number}"], held[f"offsets {number}"]
+        changed, offsets = arrays[f"changed {number}"], arrays[f"offsets {number}"]
         inside = (changed >= 0) & (changed < n_vertices)
         np.add.at(morphs[number], changed[inside], offsets[inside])
     return morphs
