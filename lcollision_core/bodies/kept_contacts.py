@@ -213,8 +213,7 @@ class _Samples:
     def of(cls, space: RigPoseSpace) -> _Samples:
         """Sample the rest pose."""
         faces, rest = space.topology.faces, space.rest_vertices
-        corners = rest[faces]
-        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        sides = space.topology.longest_sides(rest)
         n_steps = np.minimum(np.ceil(sides / _SPACING), 99).astype(np.int64)
         owners, shares = list[npt.NDArray[np.intp]](), list[FloatArray]()
         for n in np.unique(np.maximum(n_steps, 1)).tolist():

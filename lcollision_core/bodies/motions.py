@@ -67,7 +67,7 @@ from lcollision_core.files.safe import atomic_write, write_bytes
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene_files import open_rigged, read_scene
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
-from lcollision_core.meshes import RigidTransform, Topology
+from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.extents import box_corners
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import (
@@ -562,18 +562,12 @@ def motion_of_transforms(
 
     @cache
     def hidden(frame: int) -> npt.NDArray[np.intp]:
-        sides = _longest_sides(body(frame).decode(codes[frame][None])[0], space.topology)
+        sides = space.topology.longest_sides(body(frame).decode(codes[frame][None])[0])
         return np.flatnonzero(sides < _HIDDEN * sides_at_rest)
 
-    sides_at_rest = _longest_sides(space.rest_vertices, space.topology)
+    sides_at_rest = space.topology.longest_sides(space.rest_vertices)
     hides = hidden if points or shown else None
     return Motion(name, times, codes, None, space_at, source, hides)
-
-
-def _longest_sides(vertices: npt.NDArray[np.floating], topology: Topology) -> FloatArray:
-    corners = vertices[topology.faces]
-    sides: FloatArray = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    return sides
 
 
 def _encoded(

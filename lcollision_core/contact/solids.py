@@ -19,7 +19,7 @@ import scipy
 from lcollision_core.contact.detector import CollisionDetector
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
-from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.topology import FloatArray, Topology, name_twice
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -265,7 +265,7 @@ def stored(
         points, faces = _mesh_of(solid.simplify(_SLIVER * height))
         vertices, of = np.unique(points.astype(dtype), axis=0, return_inverse=True)
         named = of.reshape(-1)[faces]
-        named = named[(named != np.roll(named, 1, axis=1)).all(axis=1)]
+        named = named[~name_twice(named)]
         topology = Topology(named, len(vertices))
         pairs = CollisionDetector(topology, vertices).detect(vertices).pairs
         if topology.is_watertight and not len(pairs):

@@ -491,7 +491,7 @@ def _rig(
     scene: Scene, mesh: JoinedMesh, rest_vertices: FloatArray, size: float
 ) -> tuple[Rig | None, tuple[str, ...]]:
     """Return the rig of the skinned parts, None without a usable one, and notes."""
-    in_skins = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
+    in_skins = scene.joints
     if not in_skins:
         return None, ()
     anchors = _anchors(scene, in_skins)
@@ -553,11 +553,10 @@ def _anchors(scene: Scene, in_skins: set[int]) -> dict[int, int]:
     A node below a joint of a skin that no clip moves is part of that joint, and so is a node of
     zero scale, which is how accessories are hidden.
     """
-    moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
-    rest = scene.rest.transforms[0]
+    rest, movers = scene.rest.transforms[0], in_skins | scene.moved
     anchors = {}
     for bone in {bone for part in scene.parts for bone in part.bones.tolist()}:
-        node, carriers = bone, in_skins if bone in in_skins else in_skins | moved
+        node, carriers = bone, in_skins if bone in in_skins else movers
         while node >= 0 and not (node in carriers and is_regular(rest[node])):
             node = int(scene.parents[node])
         anchors[bone] = node if node in in_skins or not is_regular(rest[bone]) else bone

@@ -73,6 +73,12 @@ def length_graph(edges: IntArray, vertices: FloatArray) -> scipy.sparse.csr_matr
     return edge_graph(edges, len(vertices), lengths)
 
 
+def name_twice(faces: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
+    """Return the mask of (F, 3) faces that use a vertex twice, and so never have area."""
+    named_twice: npt.NDArray[np.bool_] = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    return named_twice
+
+
 def meeting_corners(
     faces: npt.NDArray[np.integer],
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
@@ -133,9 +139,7 @@ class Topology:
                 where=f"face {face}",
                 expected=f"0 to {n_vertices - 1}",
             )
-        repeated = np.flatnonzero(
-            (checked == np.roll(checked, 1, axis=1)).any(axis=1),
-        )
+        repeated = np.flatnonzero(name_twice(checked))
         if len(repeated):
             face = int(repeated[0])
             raise PoseSetError(
@@ -263,6 +267,13 @@ class Topology:
     def edge_lengths(self, vertices: npt.NDArray[Any]) -> FloatArray:
         """Return the (E,) lengths of `edges` in one pose, `vertices` (V, 3), in its unit."""
         return _lengths(self.edges, np.asarray(vertices, dtype=np.float64))
+
+    def longest_sides(self, vertices: npt.NDArray[np.floating]) -> FloatArray:
+        """Return the (F,) length of each face's longest side in one pose, `vertices` (V, 3)."""
+        corners = vertices[self.faces]
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+        longest: FloatArray = sides.max(axis=1)
+        return longest
 
 
 def degenerate_faces(topology: Topology, vertices: npt.NDArray[Any]) -> npt.NDArray[np.int32]:

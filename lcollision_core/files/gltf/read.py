@@ -48,7 +48,7 @@ from lcollision_core.files.scene.scene import (
 )
 from lcollision_core.files.scene.transforms import compose, global_transforms
 from lcollision_core.json_values import quoted
-from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.topology import FloatArray, name_twice
 
 _INSTANCING, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
 _LEVELS, _CONSTRAINT = "MSFT_lod", "VRMC_node_constraint"
@@ -480,7 +480,7 @@ def _faces(
             picked = np.stack([step, step + 1 + odd, step + 2 - odd], axis=1)
         faces = corners[picked]
         # Degenerate triangles join strips.
-        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+        faces = faces[~name_twice(faces)]
     else:
         if len(corners) % 3:
             raise MeshFileError(f"has {len(corners)} corners, not a multiple of 3", where=where)

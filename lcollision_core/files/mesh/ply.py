@@ -15,6 +15,7 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.mesh.polygons import Polygons, read_rest, require_plausible_count
 from lcollision_core.files.mesh.text import number_rows, plain_lines, vertex_numbers
+from lcollision_core.meshes.topology import name_twice
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -124,9 +125,7 @@ def _triangles_of_strips(
     triangles: npt.NDArray[np.int64] = corners[
         np.stack([first + is_odd, first + 1 - is_odd, first + 2], axis=1)
     ]
-    is_flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
-    triangles = triangles[~is_flat]
-    return triangles.reshape(-1)
+    return triangles[~name_twice(triangles)].reshape(-1)
 
 
 def _read_header(file: BinaryIO) -> tuple[str | None, list[_Element]]:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.topology import Topology
+from lcollision_core.meshes.topology import Topology, name_twice
 from lcollision_core.sentences import say_number
 
 MAX_FACES = 5_000_000
@@ -93,13 +93,21 @@ def with_order_of(
 def first_at_each_position(points: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
     """Return, for each of (n, 3) points, the index of the first point with equal coordinates."""
     # Adding 0.0 turns -0.0 into 0.0, so that equal coordinates have equal bits.
-    bits = (np.ascontiguousarray(points, dtype=np.float64) + 0.0).view(np.uint64)
-    order = np.lexsort(bits.T)
-    is_new = np.ones(len(order), dtype=np.bool_)
-    is_new[1:] = (bits[order[1:]] != bits[order[:-1]]).any(axis=1)
-    first = np.empty_like(order)
-    first[order] = order[is_new][np.cumsum(is_new) - 1]
-    return first
+    bits = (np.ascontiguousarray(points, dtype=np.float64) + 0.0).view(np.int64)
+    first, which = first_of_equal(bits)
+    return first[which]
+
+
+def first_of_equal(
+    rows: npt.NDArray[np.integer],
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Return the first of each set of equal rows, ascending, and the set of each row."""
+    flat = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1])))
+    _, first, which = np.unique(flat[:, 0], return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return first[order], rank[which.reshape(-1)]
 
 
 def require_plausible_count(count: int, what: str) -> None:
@@ -199,7 +207,7 @@ def triangulate(polygons: Polygons, topology: Topology | None = None) -> Triangu
     second = np.arange(len(first)) + 2 * polygon_of + 1
     fans = np.stack([first, second, second + 1], axis=1)
     cut_of = polygon_of if polygons.cut_of is None else polygons.cut_of
-    is_flat = _name_twice(corners[fans]) & (sizes[polygon_of] == 3)
+    is_flat = name_twice(corners[fans]) & (sizes[polygon_of] == 3)
     if is_flat.any():
         notes.append(_left_out(cut_of[is_flat]))
         fans, cut_of, polygon_of = fans[~is_flat], cut_of[~is_flat], polygon_of[~is_flat]
@@ -217,16 +225,10 @@ def triangulate(polygons: Polygons, topology: Topology | None = None) -> Triangu
             fans[rows], doubtful = _cut_by_shape(points, corners, fans[rows], polygon_of[rows])
         notes += _doubts(doubtful)
     faces = corners[fans]
-    is_flat = _name_twice(faces)
+    is_flat = name_twice(faces)
     if is_flat.any():
         notes.append(_left_out(cut_of[is_flat]))
     return Triangulation(faces[~is_flat], cut_of[~is_flat], tuple(notes))
-
-
-def _name_twice(faces: IntArray) -> npt.NDArray[np.bool_]:
-    """Return the mask of (F, 3) faces that use a vertex twice, and so never have area."""
-    named_twice: npt.NDArray[np.bool_] = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    return named_twice
 
 
 def _left_out(polygon: IntArray) -> str:
@@ -318,9 +320,8 @@ def _cut_by_shape(
     squares = np.einsum("sfi,sfi->sf", sides, sides).max(axis=0)
     size = np.sqrt(np.maximum.reduceat(squares, starts))
     heights = np.abs(np.einsum("sfi,fi->sf", sides, normals[which])).max(axis=0)
-    vertices = corners[fans]
     is_covering = np.einsum("fi,fi->f", areas, normals[which]) >= -_ROUNDING * area[which]
-    is_covering &= (vertices != np.roll(vertices, 1, axis=1)).all(axis=1)
+    is_covering &= ~name_twice(corners[fans])
     has_area = area > _LEAST_AREA * size**2
     is_doubtful = ~has_area
     is_doubtful |= np.maximum.reduceat(heights, starts) > _MOST_BEND * np.sqrt(area / 2.0)

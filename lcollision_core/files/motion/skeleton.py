@@ -174,7 +174,7 @@ def skeleton_nodes(scene: Scene) -> list[int]:
         if parents[node] >= 0:
             below[parents[node]] += below[node]
     roots = [node for node in order if parents[node] < 0]
-    moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
+    moved = scene.moved
     root = max(roots, key=lambda node: below[node])
     while root not in moved and root not in scene.bound:
         children = [node for node in order if parents[node] == root and below[node]]

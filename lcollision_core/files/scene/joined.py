@@ -10,14 +10,20 @@ import numpy.typing as npt
 import scipy
 
 from lcollision_core.errors import MeshFileError, listed
-from lcollision_core.files.mesh.polygons import are_of_same_polygons
+from lcollision_core.files.mesh.polygons import are_of_same_polygons, first_of_equal
 from lcollision_core.files.scene.appearance import Appearance, join_appearances
 from lcollision_core.files.scene.scene import MAX_FRAME_NUMBERS, Part, Scene, ScenePoses
 from lcollision_core.files.scene.transforms import blend_dual_quaternions
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.contact_rules import MAX_GROUP_NAME_LENGTH
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
-from lcollision_core.meshes.topology import FloatArray, Topology, consecutive, degenerate_faces
+from lcollision_core.meshes.topology import (
+    FloatArray,
+    Topology,
+    consecutive,
+    degenerate_faces,
+    name_twice,
+)
 
 IntArray = npt.NDArray[np.int64]
 
@@ -226,7 +232,7 @@ def join_parts(scene: Scene) -> JoinedMesh:
     keys = np.concatenate(
         [places.view(np.int64), bone_of, weights.view(np.int64), morph_of], axis=1
     )
-    first_vertices, joined = _first_of_equal(keys)
+    first_vertices, joined = first_of_equal(keys)
     faces = np.concatenate([joined[part.faces + first_vertex[i]] for i, part in enumerate(parts)])
     # The numbers of polygons need only ascend.
     n_before = np.cumsum([0] + [len(part.faces) for part in parts])
@@ -236,7 +242,7 @@ def join_parts(scene: Scene) -> JoinedMesh:
             for n, part in zip(n_before.tolist(), parts, strict=False)
         ]
     )
-    is_flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    is_flat = name_twice(faces)
     morphs = []
     for i, part in enumerate(parts):
         local = first_vertices[
@@ -342,21 +348,11 @@ def _morph_numbers(parts: tuple[Part, ...]) -> IntArray:
             deltas.append(given.reshape(len(moved), -1) + np.float32(0.0))
         if not node_parts:
             continue
-        _, kind = _first_of_equal(np.concatenate(deltas).view(np.int32))
+        _, kind = first_of_equal(np.concatenate(deltas).view(np.int32))
         kinds = np.split(kind, np.cumsum([len(moved) for moved in rows])[:-1])
         for i, moved, which in zip(node_parts, rows, kinds, strict=True):
             result[i][moved, 0], result[i][moved, 1] = node + 1, which
     return np.concatenate(result)
-
-
-def _first_of_equal(rows: npt.NDArray[np.integer]) -> tuple[IntArray, IntArray]:
-    """Return the first of each set of equal rows, ascending, and the set of each row."""
-    flat = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1])))
-    _, first, which = np.unique(flat[:, 0], return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return first[order], rank[which.reshape(-1)]
 
 
 def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tuple[FaceGroup, ...]:

@@ -264,6 +264,16 @@ class Scene:
         """Rows of each part's points among those of all parts."""
         return consecutive(len(part.points) for part in self.parts)
 
+    @property
+    def joints(self) -> set[int]:
+        """Nodes that are joints of skins."""
+        return {bone for part in self.parts if part.is_skinned for bone in part.bones.tolist()}
+
+    @property
+    def moved(self) -> frozenset[int]:
+        """Nodes that a clip moves, without those that follow them."""
+        return frozenset[int]().union(*(clip.moved for clip in self.clips))
+
 
 def by_node(parts: Sequence[Part], values: Sequence[FloatArray]) -> dict[int, FloatArray]:
     """Return the (N, M) morph target values of each node, the longest of its parts."""
@@ -280,10 +290,8 @@ def character_parts(scene: Scene) -> list[int]:
     Floors, backdrops and other scenery do not: no joint carries them, and no clip moves them, other
     than by nodes above the skeleton.
     """
-    joints = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
-    with_carriers = partial(lineage, scene.parents)
-    moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
-    movers = joints | moved.difference(*map(with_carriers, joints))
+    joints, with_carriers = scene.joints, partial(lineage, scene.parents)
+    movers = joints | scene.moved.difference(*map(with_carriers, joints))
     return [
         number
         for number, part in enumerate(scene.parts)
@@ -438,8 +446,7 @@ def _revealed(scene: Scene, node: int) -> Scene:
         if not set(part.bones[part.bone_of[part.weights > 0.0]].tolist()).isdisjoint(below)
     ]
     note = f"hidden at rest by its scale, shown as in the clip {clip_name!r}"
-    joints = {bone for part in parts if part.is_skinned for bone in part.bones.tolist()}
-    if not joints.isdisjoint(lineage(scene.parents, node)[1:]):
+    if not scene.joints.isdisjoint(lineage(scene.parents, node)[1:]):
         # A node that a clip only shows and hides is carried by its joint.
         clips = tuple(replace(clip, moved=clip.moved - {node}) for clip in scene.clips)
         scene = replace(scene, clips=clips)
