@@ -18,6 +18,17 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def limit_library_threads() -> None:
+    """Keep the threads of libraries off the cores of ours; call it before NumPy and torch load.
+
+    Small matrix products take microseconds, and distributing them takes longer. Torch's threads
+    wait for the next operation by spinning, which by default takes our threads' cores for
+    milliseconds.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+
+
 class Job:
     """Link between the thread that does long work and those that watch it.
 

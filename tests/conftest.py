@@ -16,6 +16,11 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 import pytest
 
+from lcollision_core.jobs import limit_library_threads
+
+# NumPy and torch may be imported before the program that would set this.
+limit_library_threads()
+
 # The process that only starts the workers loads this file too, so other imports are in functions.
 if TYPE_CHECKING:
     from typer.testing import Result

@@ -23,9 +23,9 @@ from typer.core import TyperGroup
 from app.cli.console import ExitStatus, note, tell_what_takes_time
 from lcollision_core import __version__
 from lcollision_core.errors import CancelledError, LCollisionError
+from lcollision_core.jobs import limit_library_threads
 
-# Small matrix products take microseconds; on a busy machine, distributing them takes longer.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+limit_library_threads()
 # PyVista imports Matplotlib, which is not used here but warns if it cannot keep a cache.
 logging.getLogger("matplotlib").setLevel(logging.ERROR)
 

@@ -54,12 +54,12 @@ def main(arguments: list[str]) -> int:
     -------
     status : 0 done, 2 an error that the user can fix, 3 a bug, 130 stopped
     """
-    # Small matrix products take microseconds; distributing them over threads takes longer.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from lcollision_core.errors import CancelledError, LCollisionError
+    from lcollision_core.jobs import Job, limit_library_threads
+
+    limit_library_threads()
     _give_way()
 
-    from lcollision_core.errors import CancelledError, LCollisionError
-    from lcollision_core.jobs import Job
     from lcollision_core.tasks.learning import learn_model
     from lcollision_core.tasks.work_folder import WorkFolder
 
