@@ -780,7 +780,7 @@ class Pins(QObject):
         if len(pins) > MAX_PINS:
             self.message.emit(f"A pose has at most {counted(MAX_PINS, 'pin', 'pins')}")
             return
-        self._set(label or f"Pin {part_name(model, grips[0].vertex)}", pins)
+        self._set_pins(label or f"Pin {part_name(model, grips[0].vertex)}", pins)
 
     def has(self, vertex: int | None) -> bool:
         """Whether a pin is on a vertex."""
@@ -799,17 +799,17 @@ class Pins(QObject):
             self.pin([self._motion.grip_at(vertex)], oriented=oriented)
         else:
             label = f"Unpin {part_name(self._history.model, vertex)}"
-            self._set(label, pins[:index] + pins[index + 1 :])
+            self._set_pins(label, pins[:index] + pins[index + 1 :])
 
     def remove_all(self) -> None:
         """Remove all pins."""
-        self._set("Unpin all", ())
+        self._set_pins("Unpin all", ())
 
     @property
     def _pins(self) -> tuple[Pin, ...]:
         return self._history.pose.pins
 
-    def _set(self, label: str, pins: tuple[Pin, ...]) -> None:
+    def _set_pins(self, label: str, pins: tuple[Pin, ...]) -> None:
         self._history.close_gesture()
         state = self._history.state
         self._history.push(label, replace(state, pose=replace(state.pose, pins=pins)))

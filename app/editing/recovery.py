@@ -223,7 +223,7 @@ class Autosave(QObject):
     ) -> None:
         super().__init__(document)
         self._document = document
-        self._told = False
+        self._has_reported = False
         self._session: Session | None = None
         try:
             self._session = Session.new(parent_folder or sessions_folder())
@@ -354,13 +354,13 @@ class Autosave(QObject):
 
     def _on_written(self, is_kept: bool) -> None:
         if is_kept:
-            self._told = False
+            self._has_reported = False
             self.written.emit()
 
     @Slot(object)
     def _on_failed(self, failure: Failure) -> None:
-        if not self._told:
-            self._told = True
+        if not self._has_reported:
+            self._has_reported = True
             headline = f"Autosave failed ({failure.headline})"
             is_motion = not self._document.timeline.are_saved()
             next_step = "export the motion" if is_motion else "save them to a file"

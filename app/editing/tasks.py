@@ -211,15 +211,15 @@ class Tasks(QObject):
     def cancel_all(self) -> None:
         """Stop all long work except preparing the model; `message` names what was cancelled."""
         self.cancel_resolve()
-        self._cancel_told(_EXPORT, Work.INCOMING, Work.CHANGE_MODEL, Work.RESOLVE_MOTION)
+        self._cancel_with_message(_EXPORT, Work.INCOMING, Work.CHANGE_MODEL, Work.RESOLVE_MOTION)
         self._long.cancel_all(but=Work.PREPARE)
 
     @Slot()
     def cancel_exports(self) -> None:
         """Stop all exports; `message` names them."""
-        self._cancel_told(_EXPORT)
+        self._cancel_with_message(_EXPORT)
 
-    def _cancel_told(self, *kinds: object) -> None:
+    def _cancel_with_message(self, *kinds: object) -> None:
         labels = self._long.labels(*kinds)
         self._long.cancel(*kinds)
         for label in labels:

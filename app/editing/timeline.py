@@ -363,7 +363,7 @@ class Timeline(QObject):
         )
         self.message.emit(joined((text, *notes)))
         self.joints, self.joints_of = read.joints, Path(path)
-        self._put(motions[0])
+        self._put_on_timeline(motions[0])
         if self._history.state.moment is None:
             # The user was asked about the edited pose before the file was read.
             self._enter(motions[0], 0)
@@ -381,12 +381,12 @@ class Timeline(QObject):
 
     def _on_clip(self, enters: bool, read: list[Motion]) -> None:
         self.motions |= {motion.name: motion for motion in read}
-        self._put(read[0])
+        self._put_on_timeline(read[0])
         # Do not end a drag in progress.
         if enters and self._history.gesture is None:
             self._go(0)
 
-    def _put(self, motion: Motion, state: DocumentState | None = None) -> None:
+    def _put_on_timeline(self, motion: Motion, state: DocumentState | None = None) -> None:
         """Put a motion on the timeline, at its first frame or in a state at one of its frames."""
         self.pause()
         self.resolving.end(_STOPPED)
@@ -402,7 +402,7 @@ class Timeline(QObject):
         if state is not None:
             history.begin(state, history.file, history.file_poses)
         elif history.state.moment is not None:
-            history.begin(self._at(motion, 0))
+            history.begin(self._state_at(motion, 0))
         self.opened.emit()
         self._check()
 
@@ -445,7 +445,9 @@ class Timeline(QObject):
             self.first, self.last = ends
             self.range_changed.emit()
 
-    def _at(self, motion: Motion, frame: int, cached: PoseFrame | None = None) -> DocumentState:
+    def _state_at(
+        self, motion: Motion, frame: int, cached: PoseFrame | None = None
+    ) -> DocumentState:
         """Return the state at a frame, with the pins moved to its patches."""
         from lcollision_core.bodies import MAX_POSE_NAME_LENGTH, NamedPose
 
@@ -477,14 +479,14 @@ class Timeline(QObject):
             assert motion is not None
             cached = self._cache.get(motion, frame)
             if cached is None:
-                history.apply(self._at(motion, frame))
+                history.apply(self._state_at(motion, frame))
             else:
-                self._pose.show(cached, self._at(motion, frame, cached))
+                self._pose.show(cached, self._state_at(motion, frame, cached))
         self._want(motion, frame)
 
     def _enter(self, motion: Motion, frame: int) -> None:
         """Make a frame the working pose, as an undo step if the present pose is unsaved."""
-        history, state = self._history, self._at(motion, frame)
+        history, state = self._history, self._state_at(motion, frame)
         if history.modified:
             history.push("Go to the motion", state)
         else:
@@ -630,7 +632,7 @@ class Timeline(QObject):
             return
         cached = self._cache.get(motion, frame)
         if cached is not None:
-            self._pose.show(cached, self._at(motion, frame, cached))
+            self._pose.show(cached, self._state_at(motion, frame, cached))
             self.playback.note_shown(frame)
         elif not self.playing:
             self._go(frame)
@@ -684,7 +686,7 @@ class Timeline(QObject):
         self._saved = {name: lost.edited[name] for name in lost.saved}
         motion, pose = lost.edited[lost.open], self._history.pose
         state = self.with_motion_edit(DocumentState(pose, moment=Moment(motion, lost.frame)))
-        self._put(lost.read[lost.open], state)
+        self._put_on_timeline(lost.read[lost.open], state)
         self._want(state.motion or motion, lost.frame)
 
     def mark_saved(self, exported: Iterable[Motion] | None = None) -> None:

@@ -660,7 +660,7 @@ class _Learner:
         def report(status: TrainingStatus) -> None:
             error = status.both_error or status.level1_error
             facts = [] if error is None else [say("error {share:.2f} %", share=100.0 * error)]
-            self._at(_TRAINED * status.done / status.total, facts)
+            self._report(_TRAINED * status.done / status.total, facts)
 
         model = learn_latent_space(
             self._work.name,
@@ -693,7 +693,7 @@ class _Learner:
             facts = []
             if share is not None:
                 facts = [say("{share:.0f} % of the samples collide", share=100.0 * share)]
-            self._at(status.done / status.total, facts)
+            self._report(status.done / status.total, facts)
 
         label_poses(
             model.labeller(SampleDistribution.MIXED),
@@ -710,7 +710,7 @@ class _Learner:
                 done = _PATCHES * status.preparing
             else:
                 done = _PATCHES + (_PASSES - _PATCHES) * status.done / status.total
-            self._at(done, [])
+            self._report(done, [])
 
         trained = train_predictor(
             store.load(effort.n_samples),
@@ -732,7 +732,7 @@ class _Learner:
         self._job.check()
         self._before = self._seconds()
         self._stage, self._began = stage, time.monotonic()
-        self._at(0.0)
+        self._report(0.0)
 
     def _seconds(self) -> dict[str, float]:
         """Return the seconds spent in each stage, by this and earlier processes."""
@@ -742,10 +742,10 @@ class _Learner:
     def _part(self, begin: float, end: float = 1.0) -> Job:
         """Return the job for a part of a stage, given by shares of the stage."""
         return self._job.part(
-            lambda done, total: self._at(begin + (end - begin) * done / max(total, 1))
+            lambda done, total: self._report(begin + (end - begin) * done / max(total, 1))
         )
 
-    def _at(self, stage_done: float, facts: Sequence[str] = ()) -> None:
+    def _report(self, stage_done: float, facts: Sequence[str] = ()) -> None:
         self._pace.report(self._stage, stage_done, facts)
 
     def _tell(self, status: LearningStatus) -> None:

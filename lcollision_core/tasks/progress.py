@@ -89,7 +89,7 @@ class Run(Generic[T]):
         self.done.update(done)
         if done:
             going_on = say(
-                "continuing from {path}, which has {done}", path=self.path, done=self._told
+                "continuing from {path}, which has {done}", path=self.path, done=self._count
             )
             self._job.note(going_on)
 
@@ -113,13 +113,13 @@ class Run(Generic[T]):
             stopped = say(
                 "stopped; {path} has {done}, run the command again when they can be written",
                 path=self.path,
-                done=self._told,
+                done=self._count,
             )
         else:
             stopped = say(
                 "stopped; {path} has {done}, run the same command again to continue",
                 path=self.path,
-                done=self._told,
+                done=self._count,
             )
         self._job.note(stopped)
 
@@ -145,7 +145,7 @@ class Run(Generic[T]):
         return not failure
 
     @property
-    def _told(self) -> str:
+    def _count(self) -> str:
         return say("{n} of {items}", n=len(self.done), items=self._items)
 
 

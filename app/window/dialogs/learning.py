@@ -127,8 +127,10 @@ class LearningDialog(Dialog):
         super().done(result)
 
     def _lay_out(self) -> None:
-        self.stop = push_button("Stop", clicked=partial(self._do, self._runs.stop))
-        self.resume = push_button("Continue", clicked=partial(self._do, self._runs.resume))
+        self.stop = push_button("Stop", clicked=partial(self._attempt_on_run, self._runs.stop))
+        self.resume = push_button(
+            "Continue", clicked=partial(self._attempt_on_run, self._runs.resume)
+        )
         self.discard = push_button("Discard…", clicked=self._discard)
         self.open_model = QPushButton("Open")
         self.open_model.clicked.connect(lambda: self.open_wanted.emit(self._require_path()))
@@ -152,7 +154,7 @@ class LearningDialog(Dialog):
         self._column.setSpacing(NORMAL)
         self.setLayout(self._column)
 
-    def _do(self, act: Callable[[Path], None]) -> None:
+    def _attempt_on_run(self, act: Callable[[Path], None]) -> None:
         self._attempt(partial(act, self._require_path()))
 
     def _require_path(self) -> Path:

@@ -241,11 +241,11 @@ class TimelineStrip(QWidget):
         ----------
         depths : (T,) float64 array, normalised; 0 if a frame is free, NaN if it is not checked yet
         """
-        self._put(_depths=depths.copy())
+        self._set_shown(_depths=depths.copy())
 
     def set_between(self, colliding: BoolArray) -> None:
         """Mark the free frames with a colliding pose between them and the next, free, frame."""
-        self._put(_between=colliding.copy())
+        self._set_shown(_between=colliding.copy())
 
     def set_curve(self, depths: FloatArray, name: str) -> None:
         """Show the curve of the overlap of a body part or the whole body.
@@ -255,7 +255,7 @@ class TimelineStrip(QWidget):
         depths : (T,) float64 array, as in `set_depths`
         name : of the body part, "" for the whole body
         """
-        self._put(_curve=depths.copy(), _curve_name=name)
+        self._set_shown(_curve=depths.copy(), _curve_name=name)
 
     def set_estimate(self, probability: FloatArray | None) -> None:
         """Show the estimated probability of a collision.
@@ -264,14 +264,14 @@ class TimelineStrip(QWidget):
         ----------
         probability : (T,) float64 array, NaN where it is unknown; None if there is no predictor
         """
-        self._put(_estimate=None if probability is None else probability.copy())
+        self._set_shown(_estimate=None if probability is None else probability.copy())
 
     def set_resolved(self, spans: Sequence[range]) -> None:
         """Show spans as free, whatever their overlaps."""
         resolved = np.zeros(len(self._times), dtype=np.bool_)
         for span in spans:
             resolved[span.start : span.stop] = True
-        self._put(_resolved=resolved)
+        self._set_shown(_resolved=resolved)
 
     def zoom_to_fit(self) -> None:
         """Show all frames."""
@@ -289,7 +289,7 @@ class TimelineStrip(QWidget):
         self._first = min(max(first, 0.0), n_frames - self._span)
         self._redraw()
 
-    def _put(self, **contents: FloatArray | BoolArray | str | None) -> None:
+    def _set_shown(self, **contents: FloatArray | BoolArray | str | None) -> None:
         """Set attributes, and redraw if one of them changes: work reports far more often."""
         changed = False
         for name, value in contents.items():
