@@ -286,14 +286,6 @@ def _environment() -> QProcessEnvironment:
     return environment
 
 
-@dataclass(frozen=True, eq=False)
-class LearnedModel:
-    """A learned model and its figures."""
-
-    model: LearnedBody
-    card: LearnedCard
-
-
 def load_learning(_: Job) -> None:
     """Import the modules for looking at runs, which takes longer than a frame."""
     import lcollision_core.tasks.learning  # noqa: F401
@@ -311,10 +303,10 @@ def look_into_sources(paths: tuple[Path, ...], job: Job) -> SourcesSummary:
     return summarise_sources(paths, job)
 
 
-def read_card(model_file: str, _: Job) -> LearnedModel:
+def read_card(model_file: str, _: Job) -> tuple[LearnedBody, LearnedCard]:
     """Read a learned model and its figures."""
     from lcollision_core.bodies import LearnedBody
     from lcollision_core.tasks.learning import card_of
 
     model = LearnedBody.load(model_file)
-    return LearnedModel(model, card_of(model, model_file))
+    return model, card_of(model, model_file)

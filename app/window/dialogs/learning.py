@@ -42,8 +42,8 @@ from lcollision_core.tasks.words import (
 )
 
 if TYPE_CHECKING:
-    from app.work.learning_runs import LearnedModel
     from app.work.threads import Failure, LongWork
+    from lcollision_core.bodies import LearnedBody
     from lcollision_core.tasks.learning import LearnedCard
 
 STAGE_WORDS: dict[str, str] = {
@@ -289,15 +289,16 @@ class LearningDialog(Dialog):
             run.work.remove()
         self._runs.poll()
 
-    def _on_card(self, path: Path, learned: LearnedModel) -> None:
+    def _on_card(self, path: Path, read: tuple[LearnedBody, LearnedCard]) -> None:
         from app.view.figures import parts_image
 
+        model, card = read
         ratio = self.devicePixelRatioF()
         width, height = round(ratio * _PICTURE.width()), round(ratio * _PICTURE.height())
-        drawn = parts_image(learned.model, width, height)
+        drawn = parts_image(model, width, height)
         pixels = QImage(drawn.tobytes(), *drawn.size, 4 * width, QImage.Format.Format_RGBA8888)
         pixels.setDevicePixelRatio(ratio)
-        self.card.show_model(learned, QPixmap.fromImage(pixels))
+        self.card.show_model(model, card, QPixmap.fromImage(pixels))
         self._card_of = path
         self._on_runs()
         self._fit()
@@ -351,17 +352,16 @@ class LearnedCardView(QWidget):
         column = vbox(self.picture, self._parts, spacing=CLOSE)
         self.setLayout(hbox(card, column, wide=card, spacing=WIDE))
 
-    def show_model(self, learned: LearnedModel, picture: QPixmap) -> None:
+    def show_model(self, model: LearnedBody, card: LearnedCard, picture: QPixmap) -> None:
         """Show another model."""
         for grid in (self.facts, self._parts):
             while (item := grid.takeAt(0)) is not None and (widget := item.widget()) is not None:
                 widget.deleteLater()
-        for row, (name, value) in enumerate(_figures(learned.card)):
+        for row, (name, value) in enumerate(_figures(card)):
             words = labelled(value, wraps=True)
             words.setMinimumWidth(_VALUE_WIDTH)
             self.facts.addWidget(labelled(name, "caption"), row, 0, Qt.AlignmentFlag.AlignTop)
             self.facts.addWidget(words, row, 1)
-        model = learned.model
         for index, (name, colour) in enumerate(
             zip(model.domain_names, model.card.domain_colours, strict=True)
         ):
