@@ -312,7 +312,7 @@ def contacts_of(
     middles_of: dict[tuple[int, int], dict[int, tuple[int, int]]] = defaultdict(dict)
     heights, level = list[FloatArray](), list[FloatArray]()
     for frame in range(len(frames)):
-        vertices = frames.space(frame, space).decode(frames.codes[frame][None])[0]
+        vertices = frames.decoded(frame, space)
         heights.append(vertices @ space.up)
         level.append(vertices - heights[-1][:, None] * space.up)
         for parts, middles in surface.touching(vertices, adjacent):
@@ -330,9 +330,7 @@ def contacts_of(
 
     @cache
     def decoded(frame: int) -> FloatArray:
-        frame_space = motion.space(frame, own_space)
-        vertices: FloatArray = frame_space.decode(motion.codes[frame][None])[0]
-        return vertices
+        return motion.decoded(frame, own_space)
 
     ground_of = list[float]()
     for name, patch, on_ground, still in _soles(source, both, np.array(heights), np.array(level)):

@@ -707,13 +707,7 @@ def contact_report(motion: Motion, check: ExactCheck) -> ContactReport | None:
     contacts = None if motion.contacts is None else motion.contacts()
     if contacts is None:
         return None
-
-    def decoded(frame: int) -> FloatArray:
-        frame_space = motion.space(frame, check.space)
-        vertices: FloatArray = frame_space.decode(motion.codes[frame][None])[0]
-        return vertices
-
-    return ContactReport.of(contacts, decoded, check.space)
+    return ContactReport.of(contacts, lambda frame: motion.decoded(frame, check.space), check.space)
 
 
 _LITTLE = 0.25

@@ -183,6 +183,11 @@ class Motion:
         """Return the pose space of the body at a time, counted in frames; `space` by default."""
         return space if self.space_at is None else self.space_at(time)
 
+    def decoded(self, frame: int, space: PoseSpace) -> FloatArray:
+        """Return the normalised (V, 3) vertices of a frame, without its placement."""
+        vertices: FloatArray = self.space(frame, space).decode(self.codes[frame][None])[0]
+        return vertices
+
     def check(self, frame: int, check: ExactCheck, share: float = 0.0) -> ExactCheck:
         """Return the exact check of one frame, with its placement and the body's shape then.
 
