@@ -529,9 +529,10 @@ def _motions(body: Body, document: Any, job: Job) -> EditedMotions | None:
     if why:
         raise _lost(name, why)
     own_file = own_motions(body)[0]
-    is_own = own_file is not None and own_file.absolute() == file.absolute()
-    clip_names = [motion.name for motion in stored.motions] if is_own else [None]
-    read_one = partial(read_motions, body, own_file if is_own and own_file else file, job=job)
+    clip_names: list[str | None] = [None]
+    if own_file is not None and own_file.absolute() == file.absolute():
+        file, clip_names = own_file, [motion.name for motion in stored.motions]
+    read_one = partial(read_motions, body, file, job=job)
     try:
         read = {motion.name: motion for clip in clip_names for motion in read_one(clip)}
     except LCollisionError as error:

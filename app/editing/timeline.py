@@ -673,14 +673,12 @@ class Timeline(QObject):
 
     def restore(self, lost: EditedMotions) -> None:
         """Restore the motions that a crash left; the pose is a frame of the open one."""
-        model, file = self._history.model, lost.file
         motions: dict[str, Motion | None] = dict(lost.read)
-        own_file, own_clips = own_motions(model)
-        if own_file is not None and own_file.absolute() == file.absolute():
-            file = own_file
+        own_file, own_clips = own_motions(self._history.model)
+        if lost.file == own_file:
             motions = dict.fromkeys(own_clips) | motions
         self._reading.cancel_all()
-        self._open_motions(file, motions)
+        self._open_motions(lost.file, motions)
         self.file_stamp = lost.stamp
         self._edited = dict(lost.edited)
         self._saved = {name: lost.edited[name] for name in lost.saved}
