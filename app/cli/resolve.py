@@ -197,6 +197,7 @@ def resolve(
     either. Where joints turn, what a player shows between frames differs a little from that:
     --substeps of its poses are looked at as well.
     """
+    from app.work.compile_ahead import compile_check_beside
     from lcollision_core.bodies.partners import with_joint_map
     from lcollision_core.tasks.exporting import output_named
     from lcollision_core.tasks.inputs import holds_motion
@@ -255,6 +256,7 @@ def resolve(
         return
     if model.is_trained:
         refuse_given(context, ("keep_feet",), "is for characters and motions", "leave it out")
+        compile_check_beside(model)
     elif of_motion.keep_feet:
         options = replace(options, standing=model.up)
     request = replace(request, fps=choice.fps or request.fps)

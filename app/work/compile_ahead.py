@@ -7,6 +7,7 @@ the check is compiled, then compiles the distance measure. Anything left is comp
 
 from __future__ import annotations
 
+import atexit
 import logging
 import subprocess
 import sys
@@ -22,6 +23,7 @@ import lcollision_core
 from lcollision_core.jobs import UNWATCHED, Job
 
 if TYPE_CHECKING:
+    from lcollision_core.bodies import Body
     from lcollision_core.contact import CollisionDetector
 
 _log = logging.getLogger(__name__)
@@ -117,6 +119,17 @@ def is_compiled() -> bool:
     return any(file.stat().st_mtime >= newest for place in places for file in place.glob(name))
 
 
+def compile_check_beside(body: Body) -> None:
+    """Compile the exact check in another process while this one compiles how a body is decoded.
+
+    That process ends with this one. Later starts take no time for it.
+    """
+    atexit.register(AHEAD.end)
+    AHEAD.begin()
+    body.decode(np.zeros(body.latent_size))
+    AHEAD.wait_for_check()
+
+
 def triangle() -> CollisionDetector:
     """Return the detector of one triangle after using it once."""
     from lcollision_core.contact import CollisionDetector
@@ -134,7 +147,7 @@ def measure(detector: CollisionDetector) -> None:
 
 
 AHEAD = CompileAhead()
-"""The editor's compiling process."""
+"""The compiling process of the editor or of a command."""
 
 
 def _run() -> None:

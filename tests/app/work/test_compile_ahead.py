@@ -8,12 +8,15 @@ import stat
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from app.work import compile_ahead
 from app.work.compile_ahead import CompileAhead, is_compiled
+from lcollision_core.bodies import NamedPose, open_body, write_poses
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import Job
+from tests.app.support import Lcollision
 from tests.app.windows import PATIENCE
 
 
@@ -80,6 +83,24 @@ def test_a_wait_is_cancelled_and_the_process_ends_with_the_window(
         ahead.wait_for_check(job)
     ahead.end()
     ahead.wait_for_all()
+
+
+@pytest.mark.parametrize("command", ["sample", "resolve"])
+def test_a_command_waits_for_the_check_that_another_process_compiles(
+    lcollision: Lcollision, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    poses, ahead = tmp_path / "poses.json", CompileAhead()
+    write_poses(poses, open_body("body"), [NamedPose("zero", np.zeros(110))])
+    monkeypatch.setattr(compile_ahead, "AHEAD", ahead)
+    # The process finds everything compiled.
+    monkeypatch.setattr(compile_ahead, "is_compiled", lambda: False)
+    words = {"sample": ["-n", 1, "--free"], "resolve": [poses]}[command]
+    result = lcollision(command, "body", *words, "-o", tmp_path / "free.json")
+    assert (result.exit_code, "free.json" in result.stderr) == (0, True), result.stderr
+    assert ahead._process is not None
+    assert ahead._checked.is_set()
+    ahead.wait_for_all()
+    assert ahead._process.returncode == 0
 
 
 def test_what_an_older_version_or_another_python_compiled_does_not_count(kept: Path) -> None:
