@@ -596,7 +596,15 @@ def _encoded(
         at_home = vertices if place is None else place.inverse().apply(vertices)
         return body.space.shaped_as(codes[frame], at_home / body.body_size)
 
-    return Motion(name, times, codes, placements, lambda time: shaped(round(time)), source)
+    def space_at(time: float) -> PoseSpace:
+        here, share = shaped(int(time)), time % 1.0
+        if share and isinstance(here, RigPoseSpace):
+            there = shaped(int(time) + 1)
+            assert isinstance(there, RigPoseSpace)
+            return here.interpolated(there, share)
+        return shaped(round(time))
+
+    return Motion(name, times, codes, placements, space_at, source)
 
 
 @dataclass(frozen=True, eq=False)

@@ -109,18 +109,11 @@ class Run(Generic[T]):
         """Write the progress, and note how to continue."""
         if not (self.done and self._write()):
             return
-        if self.is_complete:
-            stopped = say(
-                "stopped; {path} has {done}, run the command again when they can be written",
-                path=self.path,
-                done=self._count,
-            )
-        else:
-            stopped = say(
-                "stopped; {path} has {done}, run the same command again to continue",
-                path=self.path,
-                done=self._count,
-            )
+        stopped = say(
+            "stopped; {path} has {done}, run the same command again to continue",
+            path=self.path,
+            done=self._count,
+        )
         self._job.note(stopped)
 
     def finish(self) -> None:

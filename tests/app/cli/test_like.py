@@ -285,7 +285,7 @@ def test_a_pose_is_written_in_whatever_form_can_hold_it(
     assert (done.exit_code == 2) == sheared
     if sheared:
         assert "figure.glb cannot be written with these poses: its joints cannot" in done.stderr
-        assert "has 1 of 1 pose, run the command again when they can be written" in done.stderr
+        assert "has 1 of 1 pose, run the same command again to continue" in done.stderr
 
 
 def test_poses_of_a_character_become_a_clip_of_its_file(

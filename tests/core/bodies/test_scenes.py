@@ -303,6 +303,23 @@ def test_a_prop_plays_its_own_clip_unless_it_is_held(
     assert held.notes == ("axe: it is held, so its own clips are left out",)
 
 
+def test_between_frames_of_a_cache_a_body_of_a_scene_has_the_shape_between(
+    folder: Path, tmp_path: Path
+) -> None:
+    parts = ScenePart(str(folder / "hero.glb")), ScenePart(str(folder / "box.obj"))
+    body, cache = body_of_scene(SceneFile(parts)), tmp_path / "grows.pc2"
+    box = body.members[1].body.reference
+    # It does not grow alike everywhere.
+    bulge = (box - box.mean(axis=0)) * [0.0, 1.0, 0.0] * (box[:, :1] > 0.9)
+    write_point_cache(cache, np.stack([box, box + bulge]), fps=30.0)
+    motion, _ = scene_motion(body, (f"box={cache}",), MotionChoice())
+    check, rows = body.exact_check(), body.vertices_of["box"]
+    at = (0, 0.0), (0, 0.5), (1, 0.0)
+    first, middle, second = (motion.vertices(n, check, share)[rows] for n, share in at)
+    assert np.abs(second - first).max() > 0.01
+    np.testing.assert_allclose(middle, 0.5 * (first + second), atol=5e-4)
+
+
 def test_a_point_cache_moves_a_whole_body_of_a_scene(folder: Path, tmp_path: Path) -> None:
     body = body_of_scene(SceneFile((ScenePart(str(folder / "hero.glb")),), "rest"))
     hero, walk = body.members[0].body, tmp_path / "walk.pc2"
