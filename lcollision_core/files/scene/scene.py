@@ -63,11 +63,6 @@ class ScenePoses:
     transforms: FloatArray
     weights: tuple[FloatArray, ...]
 
-    def part(self, pose: int) -> ScenePoses:
-        """Return a single pose."""
-        rows = slice(pose, pose + 1)
-        return ScenePoses(self.transforms[rows], tuple(of_part[rows] for of_part in self.weights))
-
 
 @dataclass(frozen=True)
 class Primitive:
