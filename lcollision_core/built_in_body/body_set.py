@@ -34,13 +34,11 @@ from lcollision_core.errors import MissingExtraError, ShapeError
 from lcollision_core.files.pose_set import PoseSet
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.normals import vertex_normals
-from lcollision_core.meshes.topology import Topology
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
 if TYPE_CHECKING:
     import pyvista
 
-
-FloatArray = npt.NDArray[np.float64]
 
 SMOOTHING_LENGTH = 0.025
 """Length, in metres, over which delta mush smooths; larger ones press the groin into the belly."""
@@ -126,7 +124,6 @@ def _multiply(p: FloatArray, q: FloatArray) -> FloatArray:
     return np.column_stack([vector, scalar])
 
 
-IntArray = npt.NDArray[np.int32]
 _Point = tuple[float, float, float]
 Project = Callable[[FloatArray], FloatArray]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import astuple, dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.built_in_body.skeleton import (
@@ -17,9 +16,7 @@ from lcollision_core.built_in_body.skeleton import (
     turn_y,
     turn_z,
 )
-
-FloatArray = npt.NDArray[np.float64]
-
+from lcollision_core.meshes.topology import FloatArray
 
 STRAIGHT = 0.998
 """Fraction of its full length to which a standing leg stretches: a knee bend of seven degrees."""

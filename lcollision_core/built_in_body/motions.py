@@ -11,15 +11,13 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
 from lcollision_core.built_in_body.figure import Arm, Figure, Foot, Leg, straight_rise
 from lcollision_core.built_in_body.skeleton import Skeleton
 from lcollision_core.bundled import bundled_file
-
-FloatArray = npt.NDArray[np.float64]
+from lcollision_core.meshes.topology import FloatArray
 
 N_FRAMES = 150
 JUMP_FRAME_RATE = 60.0

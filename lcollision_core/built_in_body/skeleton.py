@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-FloatArray = npt.NDArray[np.float64]
+from lcollision_core.meshes.topology import FloatArray
 
 _TRUNK: dict[str, tuple[str | None, str]] = {
     "pelvis": (None, "root"),

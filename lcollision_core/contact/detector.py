@@ -55,13 +55,11 @@ from lcollision_core.meshes.contact_rules import N_RULES, STRICT, ContactRules, 
 from lcollision_core.meshes.extents import body_size
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.precision import can_hold, first_not_finite
-from lcollision_core.meshes.topology import Topology
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
 if TYPE_CHECKING:
     from lcollision_core.contact.gpu_search import GpuSearch
 
-IntArray = npt.NDArray[np.int32]
-FloatArray = npt.NDArray[np.float64]
 
 MAX_BODY_SIZE = 1e150
 """Largest body size in its unit; the least is the inverse. Squared lengths then neither overflow

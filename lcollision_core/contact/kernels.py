@@ -24,8 +24,7 @@ from lcollision_core.contact.arrays import (
     PoseWorkspace,
     SkippableNodes,
 )
-
-FloatArray = npt.NDArray[np.float64]
+from lcollision_core.meshes.topology import FloatArray
 
 LEAF_SIZE = 8
 """Faces in a leaf of the tree: the number that one vector instruction compares."""

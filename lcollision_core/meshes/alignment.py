@@ -14,8 +14,7 @@ import numpy.typing as npt
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.extents import body_size
-
-FloatArray = npt.NDArray[np.float64]
+from lcollision_core.meshes.topology import FloatArray
 
 _MAX_ROUNDS = 100
 _WEIGHT_TOLERANCE = 1e-4

@@ -14,6 +14,7 @@ import scipy
 from lcollision_core.errors import PoseSetError, ShapeError
 
 IntArray = npt.NDArray[np.int32]
+Int64Array = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float64]
 
 _LEAST_LENGTH = 1e-12

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.errors import LCollisionError
@@ -18,11 +17,9 @@ from lcollision_core.files.character_reading import character_of
 from lcollision_core.files.safe import read_regular
 from lcollision_core.files.scene.scene import Part, Scene, ScenePoses
 from lcollision_core.meshes import FaceGroup
+from lcollision_core.meshes.topology import FloatArray, Int64Array
 from lcollision_core.meshes.trees import ancestry
 from lcollision_core.serve.messages import Array, MeshPart, Open, OpenMesh
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 _LEAST_DETERMINANT = 1e-12
 _MOST_POSES, _RATE = 300, 10.0
@@ -46,11 +43,11 @@ class OpenedCharacter:
 
     body: RigBody
     joint_names: tuple[str, ...]
-    joints: IntArray
+    joints: Int64Array
     n_vertices: int
-    vertices: IntArray
-    joined: IntArray
-    faces: IntArray
+    vertices: Int64Array
+    joined: Int64Array
+    faces: Int64Array
 
     def transforms(self, given: Array, *leading: int | None) -> FloatArray:
         """Return the transforms of the rig's joints from the client's (..., J, 4, 4) ones."""
@@ -66,7 +63,7 @@ class OpenedCharacter:
         """Return the body parts that joints belong to; see `joint_indices`."""
         return frozenset(self.body.space.part_of_joint[self.joint_indices(joints)].tolist())
 
-    def joint_indices(self, joints: list[str]) -> IntArray:
+    def joint_indices(self, joints: list[str]) -> Int64Array:
         """Return the rig's indices of joints given by name.
 
         Raises
@@ -80,7 +77,7 @@ class OpenedCharacter:
         is_named = np.isin(self.joints, [numbers[name] for name in joints])
         return np.flatnonzero(is_named)
 
-    def turns(self, before: FloatArray, after: FloatArray) -> tuple[IntArray, FloatArray]:
+    def turns(self, before: FloatArray, after: FloatArray) -> tuple[Int64Array, FloatArray]:
         """Return how joints turn between the poses `before` and `after`, in their local frames.
 
         Parameters
@@ -234,7 +231,7 @@ def open_arrays(message: OpenMesh) -> OpenedCharacter:
 def _further(message: OpenMesh, character: Character) -> list[FaceGroup]:
     """Return the parts' groups of vertices as groups of faces, merged by name."""
     assert character.file is not None
-    corners, faces_of_group, first = [], dict[str, list[IntArray]](), 0
+    corners, faces_of_group, first = [], dict[str, list[Int64Array]](), 0
     for part in message.parts:
         n = part.vertices.shape[0]
         corners.append(part.faces.indices("faces", (None, 3), n) + first)
@@ -273,7 +270,7 @@ def _with_poses(character: Character, poses: ScenePoses) -> Character:
     return replace(character, clips=clips, sample=lambda clip, fps: frames)  # noqa: ARG005
 
 
-def _opened(body: RigBody, names: tuple[str, ...], joints: IntArray) -> OpenedCharacter:
+def _opened(body: RigBody, names: tuple[str, ...], joints: Int64Array) -> OpenedCharacter:
     joined = body.character.joined
     vertices = np.zeros(body.n_vertices, dtype=np.int64)
     # Of joined vertices, the first.

@@ -8,7 +8,6 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lcollision_core.bodies import propose_rules
 from lcollision_core.bodies.motions import motion_of_transforms
@@ -16,6 +15,7 @@ from lcollision_core.compiled import working_seconds
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
+from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import (
     Motion,
     MotionReport,
@@ -32,7 +32,6 @@ from lcollision_core.posing import DragOptions, ExactCheck, PoseDragger, make_gr
 from lcollision_core.serve import messages as m
 from lcollision_core.serve.characters import OpenedCharacter
 
-FloatArray = npt.NDArray[np.float64]
 Reply = dict[str, Any]
 
 MOST_PAIRS = 20_000

@@ -34,7 +34,7 @@ from lcollision_core.files.scene.transforms import (
     signs_on_one_side,
 )
 from lcollision_core.meshes.normals import unit
-from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.topology import FloatArray, Int64Array
 
 
 def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:
@@ -50,8 +50,6 @@ def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:
     mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
     return bytes(trimesh.Scene(mesh).export(file_type="glb", include_normals=True))
 
-
-IntArray = npt.NDArray[np.int64]
 
 _WRAPS = {Wrap.REPEAT: 10497, Wrap.MIRROR: 33648, Wrap.CLAMP: 33071}
 
@@ -80,7 +78,7 @@ class MadeGltf:
     """
 
     data: bytes
-    vertices: IntArray
+    vertices: Int64Array
     delays: dict[str, float]
     notes: tuple[str, ...]
 
@@ -209,7 +207,7 @@ class _Maker:
             nodes.append(node)
         return nodes
 
-    def _add_part(self, number: int, part: Part) -> IntArray:
+    def _add_part(self, number: int, part: Part) -> Int64Array:
         """Add the mesh of a part, and return the part's vertex for each one in the file."""
         look = _ordered(_look(part), len(part.points))
         self._notes += look.notes
@@ -265,7 +263,7 @@ class _Maker:
         return np.tile(look.vertices, len(mesh["primitives"]))
 
     def _primitives(
-        self, part: Part, look: Appearance, faces: IntArray, attributes: dict[str, int]
+        self, part: Part, look: Appearance, faces: Int64Array, attributes: dict[str, int]
     ) -> list[dict[str, Any]]:
         """Return a primitive for each material, all on the same vertices to keep their order."""
         kinds, kind_of = np.unique(
@@ -291,7 +289,7 @@ class _Maker:
             primitives.append(primitive)
         return primitives
 
-    def _influences(self, part: Part, vertices: IntArray) -> dict[str, int]:
+    def _influences(self, part: Part, vertices: Int64Array) -> dict[str, int]:
         """Return joints and weights of vertices in sets of four, strongest first."""
         strongest = np.argsort(-part.weights, axis=1, kind="stable")
         width = -(-max(int((part.weights > 0.0).sum(axis=1).max()), 1) // 4) * 4

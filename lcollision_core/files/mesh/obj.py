@@ -31,6 +31,7 @@ from lcollision_core.files.mesh.text import (
 )
 from lcollision_core.files.safe import read_regular, write_bytes
 from lcollision_core.meshes.normals import moved_normals
+from lcollision_core.meshes.topology import FloatArray
 
 _SHORTEST_LINE = len(b"f 1 2 3\n")
 _NORMAL_OF_CORNER = re.compile(rb"[^\s/]+(?:/[^\s/]*)?(?:/([^\s/]*))?")
@@ -239,8 +240,6 @@ def _one_word(name: str) -> str:
     """Return a name with the characters replaced that would split it into several words."""
     return re.sub(r"[\s#\\]+", "_", name)
 
-
-FloatArray = npt.NDArray[np.float64]
 
 _BLANKS = rb"(?:[ \t\v\f]|\\(?:\r\n|\n|\r))"
 _WORD = rb"[^\s\\]+"

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.topology import Topology, name_twice
+from lcollision_core.meshes.topology import FloatArray, Int64Array, Topology, name_twice
 from lcollision_core.sentences import say_number
 
 MAX_FACES = 5_000_000
@@ -142,9 +142,6 @@ _LEAST_AREA = 1e-12
 _MOST_BEND = 0.5
 """Largest distance of a polygon from its plane, relative to the square root of its area."""
 
-IntArray = npt.NDArray[np.int64]
-FloatArray = npt.NDArray[np.float64]
-
 
 class Triangulation(NamedTuple):
     """The result of triangulating polygons.
@@ -156,8 +153,8 @@ class Triangulation(NamedTuple):
     notes : a sentence for each kind of polygon
     """
 
-    faces: IntArray
-    cut_of: IntArray
+    faces: Int64Array
+    cut_of: Int64Array
     notes: tuple[str, ...]
 
 
@@ -231,7 +228,7 @@ def triangulate(polygons: Polygons, topology: Topology | None = None) -> Triangu
     return Triangulation(faces[~is_flat], cut_of[~is_flat], tuple(notes))
 
 
-def _left_out(polygon: IntArray) -> str:
+def _left_out(polygon: Int64Array) -> str:
     """Describe the triangles with two equal corners that are left out, by their polygons."""
     if len(polygon) == 1:
         return f"face {polygon[0]} (from 0), which has two equal corners, was left out"
@@ -242,7 +239,7 @@ def _left_out(polygon: IntArray) -> str:
 
 
 def are_of_same_polygons(
-    faces: npt.NDArray[np.integer], others: npt.NDArray[np.integer], cut_of: IntArray
+    faces: npt.NDArray[np.integer], others: npt.NDArray[np.integer], cut_of: Int64Array
 ) -> bool:
     """Whether two triangulations are of the same polygons.
 
@@ -273,7 +270,9 @@ def are_of_same_polygons(
     return not np.add.reduceat(sign.ravel()[order], np.flatnonzero(is_first)).any()
 
 
-def _without_repeats(sizes: IntArray, corners: IntArray) -> tuple[IntArray, IntArray, list[str]]:
+def _without_repeats(
+    sizes: Int64Array, corners: Int64Array
+) -> tuple[Int64Array, Int64Array, list[str]]:
     """Leave out corners with the same vertex as the next one, if three corners remain."""
     ends = np.cumsum(sizes)
     filled = np.flatnonzero(sizes > 0)
@@ -291,8 +290,8 @@ def _without_repeats(sizes: IntArray, corners: IntArray) -> tuple[IntArray, IntA
 
 
 def _cut_by_shape(
-    points: FloatArray, corners: IntArray, fans: IntArray, polygon_of: IntArray
-) -> tuple[IntArray, IntArray]:
+    points: FloatArray, corners: Int64Array, fans: Int64Array, polygon_of: Int64Array
+) -> tuple[Int64Array, Int64Array]:
     """Clip the ears of polygons that their fans do not cover.
 
     Parameters
@@ -350,7 +349,7 @@ def _cut_by_shape(
     return fans, polygon_of[starts[is_doubtful]]
 
 
-def _doubts(polygons: IntArray) -> list[str]:
+def _doubts(polygons: Int64Array) -> list[str]:
     """Describe the polygons that programs triangulate differently."""
     if not len(polygons):
         return []
@@ -378,7 +377,7 @@ def _is_same(points: FloatArray, a: int, b: int) -> bool:
 
 @compiled_part
 def _is_ear(
-    points: FloatArray, before: IntArray, after: IntArray, corner: int, slack: float
+    points: FloatArray, before: Int64Array, after: Int64Array, corner: int, slack: float
 ) -> bool:
     """Whether a corner is convex and its triangle, enlarged by `slack`, contains no other corners.
 
@@ -406,8 +405,8 @@ def _is_ear(
 
 @compiled
 def _clip_ears(
-    points: FloatArray, starts: IntArray, sizes: IntArray
-) -> tuple[IntArray, npt.NDArray[np.bool_]]:
+    points: FloatArray, starts: Int64Array, sizes: Int64Array
+) -> tuple[Int64Array, npt.NDArray[np.bool_]]:
     """Clip the ears of counterclockwise polygons of size about 1.
 
     All triangles are counterclockwise too, or have no area, and their inner edges cancel. So the

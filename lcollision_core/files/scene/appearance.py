@@ -13,12 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.topology import Int64Array
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-
-IntArray = npt.NDArray[np.int64]
 
 LEAST_SEEN = 1.0 / 255.0
 """Opacity below which a blended material is invisible."""
@@ -92,17 +91,17 @@ class Appearance:
         the file
     """
 
-    vertices: IntArray
-    faces: IntArray
+    vertices: Int64Array
+    faces: Int64Array
     uv: npt.NDArray[np.float32]
     colours: npt.NDArray[np.uint8]
-    material_of: IntArray
+    material_of: Int64Array
     materials: tuple[Material, ...]
     notes: tuple[str, ...] = ()
     normals: npt.NDArray[np.float32] | None = None
 
     @classmethod
-    def plain(cls, n_vertices: int, faces: IntArray) -> Appearance:
+    def plain(cls, n_vertices: int, faces: Int64Array) -> Appearance:
         """Return the appearance of a white mesh, with a point for each vertex."""
         return cls(
             np.arange(n_vertices),
@@ -121,7 +120,7 @@ class Appearance:
 
 
 def join_appearances(
-    parts: Sequence[Appearance], counts: Sequence[int], joined: IntArray
+    parts: Sequence[Appearance], counts: Sequence[int], joined: Int64Array
 ) -> Appearance:
     """Join the appearances of the parts of a mesh.
 

@@ -43,9 +43,7 @@ from lcollision_core.files.scene.scene import (
 )
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import quoted
-from lcollision_core.meshes.topology import FloatArray
-
-IntArray = npt.NDArray[np.int64]
+from lcollision_core.meshes.topology import FloatArray, Int64Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +62,13 @@ class MeshFaces:
 
     number: int
     is_used: npt.NDArray[np.bool_]
-    corners: IntArray
-    sizes: IntArray
-    faces: IntArray
-    polygon_of: IntArray
-    material_of: IntArray
+    corners: Int64Array
+    sizes: Int64Array
+    faces: Int64Array
+    polygon_of: Int64Array
+    material_of: Int64Array
 
-    def faces_of_corners(self) -> IntArray:
+    def faces_of_corners(self) -> Int64Array:
         """Return the (F, 3) triangles as indices into `corners`."""
         n = int(self.corners.max()) + 1
         keys = np.repeat(np.arange(len(self.sizes)), self.sizes) * n + self.corners

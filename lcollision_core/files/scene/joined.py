@@ -19,13 +19,12 @@ from lcollision_core.meshes.contact_rules import MAX_GROUP_NAME_LENGTH
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
 from lcollision_core.meshes.topology import (
     FloatArray,
+    Int64Array,
     Topology,
     consecutive,
     degenerate_faces,
     name_twice,
 )
-
-IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +32,7 @@ class _Morphs:
     """Morph targets of n `vertices`: (M, n, 3) `deltas` with the weights of `part`."""
 
     part: int
-    vertices: IntArray
+    vertices: Int64Array
     deltas: npt.NDArray[np.float32]
 
 
@@ -62,9 +61,9 @@ class JoinedMesh:
     """
 
     topology: Topology
-    cut_of: IntArray
-    joined: IntArray
-    bones: IntArray
+    cut_of: Int64Array
+    joined: Int64Array
+    bones: Int64Array
     bind: FloatArray
     bone_of: npt.NDArray[np.int32]
     weights: FloatArray
@@ -287,7 +286,7 @@ def join_parts(scene: Scene) -> JoinedMesh:
     )
 
 
-def _topology(faces: IntArray, is_left_out: npt.NDArray[np.bool_], n_vertices: int) -> Topology:
+def _topology(faces: Int64Array, is_left_out: npt.NDArray[np.bool_], n_vertices: int) -> Topology:
     if len(faces) and is_left_out.all():
         raise MeshFileError(
             "none of its faces has an area in its rest pose",
@@ -298,7 +297,7 @@ def _topology(faces: IntArray, is_left_out: npt.NDArray[np.bool_], n_vertices: i
     return Topology(faces[~is_left_out], n_vertices)
 
 
-def _common_bones(parts: tuple[Part, ...]) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
+def _common_bones(parts: tuple[Part, ...]) -> tuple[Int64Array, FloatArray, Int64Array, FloatArray]:
     """Give the bones of all parts common numbers, and sort those of each vertex.
 
     Returns
@@ -332,7 +331,7 @@ def _common_bones(parts: tuple[Part, ...]) -> tuple[IntArray, FloatArray, IntArr
     return np.array(bones, dtype=np.int64), bind, bone_of, weights
 
 
-def _morph_numbers(parts: tuple[Part, ...]) -> IntArray:
+def _morph_numbers(parts: tuple[Part, ...]) -> Int64Array:
     """Return (W, 2) numbers that are equal for vertices with equal morph deltas; 0, 0 for none."""
     result = [np.zeros((len(part.points), 2), dtype=np.int64) for part in parts]
     # The parts that one node shows share their weights.
@@ -358,7 +357,7 @@ def _morph_numbers(parts: tuple[Part, ...]) -> IntArray:
 def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tuple[FaceGroup, ...]:
     """Return the faces of each mesh and material, merged by name."""
     number = np.cumsum(~is_left_out) - 1
-    faces_of: dict[str, list[IntArray]] = {}
+    faces_of: dict[str, list[Int64Array]] = {}
     meshes: set[str] = set()
     for part, rows in zip(parts, consecutive(len(part.faces) for part in parts), strict=True):
         is_kept = ~is_left_out[rows]
