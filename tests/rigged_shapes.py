@@ -168,7 +168,7 @@ def sunk_arm(n_frames: int = 10) -> Character:
     transforms = turned(rig, turns)
     names = tuple(f"moves {frame}" for frame in range(n_frames))
     frames = ClipFrames(
-        "moves", names, times, transforms, lambda: np.stack([skinned(rig, t) for t in transforms])
+        names, times, transforms, lambda: np.stack([skinned(rig, t) for t in transforms])
     )
     return replace(body, clips={"moves": float(times[-1])}, sample=lambda *_: frames)
 
@@ -247,7 +247,6 @@ def character_of(
         transforms = turned(rig, rotations.reshape(*turns.shape, 3))
         names = tuple(f"moves {frame}" for frame in range(n_frames))
         return ClipFrames(
-            "moves",
             names,
             times,
             transforms,

@@ -261,7 +261,6 @@ class ClipFrames:
 
     Attributes
     ----------
-    clip : name of the clip
     names : N names such as "moves 12", numbered from 0 by frame
     times : (N,) float64 array, in seconds
     transforms : (N, J, 4, 4) float64 array, global transforms of the rig's joints; None without rig
@@ -272,7 +271,6 @@ class ClipFrames:
     shapes : (N, S) float64 array, sliders of `Rig.shapes`; None if there are none
     """
 
-    clip: str
     names: tuple[str, ...]
     times: FloatArray
     transforms: FloatArray | None

@@ -307,12 +307,12 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
 
         names = tuple(f"{clip} {frame}" for frame in range(len(times)))
         if rig is None:
-            return ClipFrames(clip, names, times, None, skin)
+            return ClipFrames(names, times, None, skin)
 
         shapes, at_rest = rig.shapes, scene.rest.weights
         numbers = None if shapes is None else shapes.numbers(poses.weights, at_rest)
         points = _points_of_frames(scene, mesh, rig, size, poses, numbers)
-        return ClipFrames(clip, names, times, poses.transforms[:, rig.nodes], skin, points, numbers)
+        return ClipFrames(names, times, poses.transforms[:, rig.nodes], skin, points, numbers)
 
     return Character(
         path.stem,

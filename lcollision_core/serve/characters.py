@@ -265,7 +265,7 @@ def _with_poses(character: Character, poses: ScenePoses) -> Character:
     names = tuple(f"pose {number}" for number in range(len(poses.transforms)))
     skin = partial(character.file.mesh.posed, poses)
     of_joints = poses.transforms[:, character.rig.nodes]
-    frames = ClipFrames("poses", names, np.arange(len(names)) / _RATE, of_joints, skin)
+    frames = ClipFrames(names, np.arange(len(names)) / _RATE, of_joints, skin)
     clips = {"poses": len(names) / _RATE} if names else {}
     return replace(character, clips=clips, sample=lambda clip, fps: frames)  # noqa: ARG005
 

@@ -30,7 +30,6 @@ def through(tmp_path_factory: pytest.TempPathFactory) -> Path:
     def sample(clip: str, fps: float | None) -> ClipFrames:  # noqa: ARG001
         rig = body.space.rig
         return ClipFrames(
-            clip,
             names,
             motion.times,
             transforms,

@@ -57,7 +57,6 @@ def swinging_body(
     def sample(clip: str, fps: float | None) -> ClipFrames:  # noqa: ARG001
         transforms = turns(clip)
         return ClipFrames(
-            clip,
             tuple(f"{clip} {frame}" for frame in range(n_frames)),
             times,
             transforms,

@@ -40,7 +40,7 @@ def with_hand_on_hip(girth: float) -> Character:
         transforms = np.stack([turned(rig, one) for one in rotations])
         names = tuple(f"{clip} {frame}" for frame in range(N_FRAMES))
         meshes = [skinned(rig, one) for one in transforms]
-        return ClipFrames(clip, names, times, transforms, lambda: np.stack(meshes))
+        return ClipFrames(names, times, transforms, lambda: np.stack(meshes))
 
     return replace(body, clips={CLIP: float(times[-1])}, sample=sample)
 
