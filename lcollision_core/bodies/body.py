@@ -22,18 +22,23 @@ from lcollision_core.bodies.mirror import (
     MirrorSource,
     PoseMirror,
     Symmetry,
-    checked_mesh,
     find_symmetry,
-    sorted_faces,
 )
 from lcollision_core.bodies.names import CodeEffect, code_names, with_regions
-from lcollision_core.errors import LCollisionError, ModelFileError, PoseSetError, ShapeError
+from lcollision_core.errors import (
+    LCollisionError,
+    ModelFileError,
+    PoseSetError,
+    ShapeError,
+    WrongScaleError,
+)
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.meshes import (
     ContactRules,
     FaceGroup,
     RigidTransform,
     Topology,
+    body_size,
     front_direction,
     groups_by_kind,
     with_named_groups,
@@ -41,7 +46,9 @@ from lcollision_core.meshes import (
 from lcollision_core.meshes.face_groups import (
     touching_groups,
 )
-from lcollision_core.meshes.topology import FloatArray, latent_array
+from lcollision_core.meshes.outliers import LARGEST_SIZE, is_torn, scale_of
+from lcollision_core.meshes.precision import can_hold, first_not_finite, in_unit
+from lcollision_core.meshes.topology import FloatArray, latent_array, sorted_faces
 
 if TYPE_CHECKING:
     from lcollision_core.bodies.rig_poses import StarterPose
@@ -391,7 +398,7 @@ class Body(ABC):
         PoseSetError : the vertex order differs, or the mesh is too far from the origin.
         CancelledError : the job was cancelled.
         """
-        mesh = checked_mesh(vertices, self.reference, self.topology, self.name, scale)
+        mesh = _checked_mesh(vertices, self.reference, self.topology, self.name, scale)
         fit = self._fit(mesh / self.body_size, job, in_place=False)
         aligning = RigidTransform(fit.rotation, fit.translation * self.body_size, scale)
         return EncodedPose(
@@ -849,3 +856,86 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+_MOST_SIZE = 20.0
+"""Size ratio limit for meshes whose edges are not scaled uniformly."""
+
+_UNITS = (0.001, 0.01, 0.0254, 0.1, 0.3048, 1.0)
+"""Metres in a millimetre, centimetre, inch, decimetre, foot and metre."""
+
+
+def _checked_mesh(
+    vertices: npt.ArrayLike,
+    reference: FloatArray,
+    topology: Topology,
+    model: str,
+    scale: float = 1.0,
+) -> FloatArray:
+    """Validate a mesh that a model is to encode; return it as float64, in the data's unit.
+
+    Parameters
+    ----------
+    vertices : (V, 3) array
+    reference : (V, 3) array, of the model
+    topology : of both
+    model : its name
+    scale : factor from the unit of `vertices` to the data's unit
+
+    Raises
+    ------
+    ShapeError : wrong shape, a coordinate that is not finite, or a scale that is not above 0.
+    WrongScaleError : the mesh is larger or smaller than the reference, as in another unit.
+    PoseSetError : the vertex order differs, or the mesh is too far from the origin for its digits.
+    """
+    mesh = np.asarray(vertices, dtype=np.float64)
+    if mesh.shape != reference.shape:
+        raise ShapeError.must_be(f"a mesh of {model}", f"of shape {reference.shape}", mesh.shape)
+    if (vertex := first_not_finite(mesh)) is not None:
+        raise ShapeError("is not finite", where=f"vertex {vertex} (from 0)")
+    if not can_hold(mesh, topology, np.float64):
+        raise PoseSetError(
+            "the mesh lies so far from the origin that its coordinates lose their digits",
+            "move it nearer to the origin",
+        )
+    mesh = in_unit(mesh, scale)
+    lengths, reference_lengths = (topology.edge_lengths(pose) for pose in (mesh, reference))
+    size, limit = scale_of(lengths, reference_lengths), LARGEST_SIZE
+    if size is None:
+        # Not scaled uniformly: perhaps not a pose, but only a large ratio indicates another unit.
+        size, limit = body_size(mesh, topology) / body_size(reference, topology), _MOST_SIZE
+    if not 1.0 / limit < size < limit:
+        sentence = (
+            f"the mesh is {float(f'{size:.3g}'):g} times as large as the body of {model!r}, "
+            f"which is {body_size(reference, topology):.3g} tall in its own unit"
+        )
+        if not 0.0 < size < np.inf:
+            raise PoseSetError(sentence, "export it again")
+        factor = likely_factor(1.0 / size) * scale
+        raise WrongScaleError(sentence, f"scale it by {factor:.6g}", factor=factor)
+    if is_torn(lengths, size * reference_lengths):
+        raise PoseSetError(
+            f"the edges of the mesh join other vertices than those of {model!r}, as if in "
+            "another vertex order",
+            "export it with the model's vertex order",
+        )
+    return mesh
+
+
+def likely_factor(measured: float) -> float:
+    """Return the factor between two common units that is nearest to a measured ratio.
+
+    Parameters
+    ----------
+    measured : > 0, ratio of sizes
+
+    Returns
+    -------
+    factor : such as 1000, 39.3701 or 2.54; `measured`, to three digits, if no factor is within
+        the range of body sizes
+    """
+    factors = np.array([factor / other for factor in _UNITS for other in _UNITS])
+    distances = np.abs(np.log(factors / measured))
+    if distances.min() > np.log(LARGEST_SIZE):
+        return float(f"{measured:.3g}")
+    return float(f"{factors[distances.argmin()]:.6g}")

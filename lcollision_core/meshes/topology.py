@@ -80,6 +80,13 @@ def name_twice(faces: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
     return named_twice
 
 
+def sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Rotate each face so that its smallest vertex index comes first, then sort the faces."""
+    turned = (np.arange(3) + faces.argmin(axis=1)[:, None]) % 3
+    rows = np.take_along_axis(faces, turned, axis=1)
+    return rows[np.lexsort(rows.T)]
+
+
 def meeting_corners(
     faces: npt.NDArray[np.integer],
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:

@@ -105,6 +105,8 @@ def gltf_of(scene: Scene, place: FloatArray, name: str, path: Path) -> MadeGltf:
 
 
 class _Maker:
+    """The glTF file of a scene while it is made: see `gltf_of`."""
+
     def __init__(self, scene: Scene, place: FloatArray, name: str, path: Path) -> None:
         self._scene, self._name = scene, name
         self._file = GltfDocument.empty(path)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import LearnedBody, NamedPose, read_poses, sample_poses, write_poses
-from lcollision_core.bodies.mirror import likely_factor
+from lcollision_core.bodies.body import likely_factor
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import MeshFileError, PoseSetError, ShapeError, WrongScaleError
 from lcollision_core.files import (
