@@ -391,7 +391,7 @@ def open_body(
         return open_character(source, up)
     if suffix in FILES and suffix != MODEL_SUFFIX and Path(source).is_file():
         raise MeshFileError(
-            f"is a {suffix} file, which holds no body that can be posed",
+            f"is a {suffix} file, not a single body that can be posed",
             f"name a model, or the file of a rigged character ({', '.join(SCENE_SUFFIXES)})",
             where=source,
         )

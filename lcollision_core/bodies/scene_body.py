@@ -171,7 +171,7 @@ class SceneBody(Body):
             domain_names=domain_names,
             domain_colours=colours,
             pose_names=("rest",),
-            source=", ".join(member.body.card.source for member in members)[:1000],
+            source=", ".join(own.body.card.source for own in members if not own.is_ground)[:1000],
             licence="unknown",
             rules=rules,
             metres=first.body.card.metres / first.place.scale,

@@ -248,6 +248,9 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
         scene = _as_asked(body_of_scene(scene_of(first_body, request.scene)), request)
         for sentence in scene.notes:
             job.note(sentence)
+        if request.joints is not None:
+            # Refused, as a scene has several skeletons.
+            with_joint_map(scene, request.joints)
         played, choice = request.scene.played, request.motion
         if request.body is not None and path.suffix.lower() == POSES_SUFFIX:
             codes = [given.pose.latent for given in read_scene_poses(scene, [path], 1.0, job)]

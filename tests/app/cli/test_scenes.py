@@ -81,6 +81,8 @@ def test_random_poses_of_a_scene_are_written_body_by_body(
     scene_file.write_text(json.dumps(described))
     info = lcollision("info", scene_file, "--json")
     assert json.loads(info.stdout)["vertices"] == len(rest)
+    scene_file.write_text(json.dumps(described | {"ground": "rest"}))
+    assert "posed by the joints of hero.glb, without" in lcollision("info", scene_file).stdout
 
 
 def test_each_pose_of_a_body_in_a_scene_is_reported_by_name(
@@ -111,6 +113,9 @@ def test_a_motion_of_the_first_body_is_checked_in_its_scene(
     own = lcollision("check", "--clips", hero, *scene)
     played = lcollision("check", "--clips", hero, "--body", hero, *scene)
     assert json.loads(played.stdout) == json.loads(own.stdout)
+    with_joints = lcollision("check", "--clips", hero, "--body", hero, "--joints", "a.json", *scene)
+    assert with_joints.exit_code == 2
+    assert "isn't a rigged character, so --joints doesn't apply" in with_joints.stderr
 
 
 @pytest.mark.slow
