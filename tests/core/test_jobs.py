@@ -9,7 +9,7 @@ import sys
 import pytest
 
 
-@pytest.mark.parametrize("user", [None, "77"])
+@pytest.mark.parametrize("user", [None, pytest.param("77", marks=pytest.mark.slow)])
 def test_the_program_limits_the_spinning_of_torch_s_threads_unless_the_user_does(
     user: str | None,
 ) -> None:
