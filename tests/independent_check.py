@@ -111,6 +111,7 @@ class IndependentRules:
             ("touching", *pair, rules["touching_radius"] * size) for pair in rules["touching"]
         ] + [("shape", *pair, 0.02 * size) for pair in rules["shape_touching"]]
         self._around: dict[tuple[int, float], set[int]] = {}
+        self._near_corner: dict[int, set[int]] = {}
 
     def _fold_limits(
         self, rest: Array, faces: npt.NDArray[np.int64], joints: list[set[int]]
@@ -135,7 +136,9 @@ class IndependentRules:
     def _may_fold(self, a: int, b: int) -> bool:
         """Whether some corners of both faces are near along the surface and in space at rest."""
         for i in self._corners[a]:
-            reached = self._vertices_around([i], self._near)
+            if i not in self._near_corner:
+                self._near_corner[i] = self._vertices_around([i], self._near)
+            reached = self._near_corner[i]
             for j in self._corners[b]:
                 apart = float(np.linalg.norm(self._rest[i] - self._rest[j]))
                 limit = min(self._limits[i], self._limits[j])
