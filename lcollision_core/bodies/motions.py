@@ -634,11 +634,13 @@ class WrittenClips:
     notes : sentences about what the file lacks
     put_back : for each motion the spans left unchanged in the file, as it could only store a worse
         result
+    stored : the motions as read back, in the body's codes; none of new clips
     """
 
     free: list[npt.NDArray[np.bool_]]
     notes: tuple[str, ...]
     put_back: list[list[range]]
+    stored: Sequence[Motion] = ()
 
 
 def write_clips(
@@ -678,9 +680,10 @@ def write_clips(
         ]
         data = written.changed(changes)
         as_read = character_of_gltf(data, file)
-    free = written.free(changes, as_read)
+    stored = written.stored(changes, as_read)
+    free = [motion.are_free(written.check) for motion in stored]
     write_bytes(path, data)
-    return WrittenClips(free, written.made.notes, put_back)
+    return WrittenClips(free, written.made.notes, put_back, stored)
 
 
 def write_new_clips(
@@ -804,10 +807,8 @@ class _ClipsOfFile:
                 )
             ]
 
-    def free(
-        self, changes: Sequence[MotionChange], as_read: Character
-    ) -> list[npt.NDArray[np.bool_]]:
-        """Return which frames of motions are free as read back from a file."""
+    def stored(self, changes: Sequence[MotionChange], as_read: Character) -> list[Motion]:
+        """Return motions as read back from a file."""
         place = self.made.frame.inverse().matrix
         # Parts hidden at rest may have become joints.
         file_rig = self.made.character.rig
@@ -816,7 +817,7 @@ class _ClipsOfFile:
         numbers = {node: joint for joint, node in enumerate(as_read.rig.nodes.tolist())}
         nodes = file_rig.nodes[np.argsort(self.made.joints)].tolist()
         joints = [numbers[node] for node in nodes]
-        free = []
+        motions = []
         for change in changes:
             name, times = change.before.name, self._times(change.before)
             frames = as_read.sample(name, times)
@@ -833,8 +834,8 @@ class _ClipsOfFile:
                 shown=vertices_of_frame,
                 shapes=self._numbers(as_read, frames),
             )
-            free.append(motion.are_free(self.check))
-        return free
+            motions.append(motion)
+        return motions
 
     def _numbers(self, character: Character, frames: ClipFrames) -> FloatArray | None:
         """Return shape codes of the file's frames in the body's order."""
@@ -867,7 +868,7 @@ def _write_own(
         put_back += worse
         change = replace(change, spans=[span for span in change.spans if span not in worse])
     verdicts = (check.is_free(codes) for codes in back.codes)
-    return WrittenClips([np.fromiter(verdicts, np.bool_, len(back))], (), [put_back])
+    return WrittenClips([np.fromiter(verdicts, np.bool_, len(back))], (), [put_back], [back])
 
 
 def _write_bvh(

@@ -660,7 +660,7 @@ def write_member_motions(
                     job.note(f"{member.name}: {sentence}")
                 (worse,) = written.put_back
                 put_back += [range(span.start + first, span.stop + first) for span in worse]
-                (stored,) = read_motions(member.body, path, motion.name, after.rate)
+                (stored,) = written.stored
                 places = body.space.codes[body.standing.index(member)]
                 codes[:, places] = stored.codes[replace(played_motion, motion=stored).frames(n)]
         files[member.name] = path

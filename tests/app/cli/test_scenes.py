@@ -23,6 +23,7 @@ from lcollision_core.tasks.scenes import (
     write_member_motions,
 )
 from tests.app.support import Lcollision, refusal
+from tests.core.fbx_builder import character_fbx
 from tests.core.motion.swings import CLIP, swinging_body
 from tests.rigged_shapes import rigged_body, write_gltf
 from tests.skeletons import PERSON, character_from
@@ -322,3 +323,22 @@ def test_what_the_clip_of_a_body_cannot_hold_is_reported(hero: Path, tmp_path: P
     collides = ~before.are_free(body.exact_check())
     said = export_scene_motion(out, body, before, after, Job())
     assert said == f"Exported each body to out; {collides.sum()} frames collide"
+
+
+def test_the_clip_of_an_fbx_is_reported_as_it_is_stored(
+    lcollision: Lcollision, hero: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("ufbx")
+    rigged = rigged_body(n_frames=8)
+    assert rigged.rig is not None
+    # Retargeting does not match joints of these names.
+    names = tuple(f"bone {number}" for number in range(len(rigged.rig.joint_names)))
+    rigged = replace(rigged, rig=replace(rigged.rig, joint_names=names))
+    source, out = character_fbx(rigged, tmp_path / "other.fbx"), tmp_path / "out"
+    scene = ("--with", hero, "--at", "hero=90,0,0")
+    done = lcollision("resolve", source, *scene, "--motion", "-o", f"{out}/", "--json")
+    assert done.exit_code == 0, done.output
+    assert sorted(path.name for path in out.iterdir()) == ["hero.glb", "other.glb"]
+    (row,) = json.loads(done.stdout)
+    assert row["free_after"] == row["frames"]
+    assert row["kept_spans"] == []
