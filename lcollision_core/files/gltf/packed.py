@@ -85,7 +85,7 @@ def _draco(
     except ImportError as error:
         raise MissingExtraError(
             "its meshes are compressed by Draco, which needs the extra 'draco'",
-            "install lcollision[draco], or export it without packed",
+            "install lcollision[draco], or export it without compression",
             where=document.path,
         ) from error
     views, accessors = document.objects("bufferViews"), document.objects("accessors")
