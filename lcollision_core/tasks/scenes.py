@@ -45,6 +45,7 @@ from lcollision_core.bodies.scene_file import (
 from lcollision_core.bundled import user_folder
 from lcollision_core.errors import LCollisionError, PoseSetError, listed
 from lcollision_core.files.formats import POSES_SUFFIX, SCENE_SUFFIXES
+from lcollision_core.files.scene_files import read_scene
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
@@ -559,11 +560,6 @@ def _asked_clips(
     all_clips = dict.fromkeys(
         own for name in body.plays for own in body.member(name).body.own_clips
     )
-    if clip is not None and clip not in all_clips:
-        clip_names = listed(map(repr, all_clips)) or "none"
-        raise LCollisionError(
-            f"has no clip {clip!r}", f"its clips are {clip_names}", where=body.name
-        )
     for name, (first_clip, start) in body.plays.items():
         member = body.member(name)
         assert member.body.own_file is not None
@@ -583,8 +579,12 @@ def _asked_clips(
             raise LCollisionError("is not NAME=CLIP or NAME=CLIP@SECONDS", where=f"--play {entry}")
         if what in member.body.own_clips and member.body.own_file is not None:
             clip_of_body[name] = member.body.own_file, what, start
-        elif Path(what).is_file():
-            clip_of_body[name] = Path(what), None, start
+        elif (file := Path(what)).is_file():
+            of_file = list[str]()
+            if clip is not None and file.suffix.lower() in SCENE_SUFFIXES:
+                of_file = [own.name for own in read_scene(file).clips]
+            all_clips |= dict.fromkeys(of_file)
+            clip_of_body[name] = file, clip if clip in of_file else None, start
         else:
             clip_names = ", ".join(member.body.own_clips) or "none"
             raise LCollisionError(
@@ -592,6 +592,11 @@ def _asked_clips(
                 f"its clips are {clip_names}",
                 where=repr(what),
             )
+    if clip is not None and clip not in all_clips:
+        clip_names = listed(map(repr, all_clips)) or "none"
+        raise LCollisionError(
+            f"has no clip {clip!r}", f"its clips are {clip_names}", where=body.name
+        )
     return clip_of_body
 
 

@@ -24,7 +24,7 @@ from lcollision_core.tasks.scenes import (
 )
 from tests.app.support import Lcollision, refusal
 from tests.core.fbx_builder import character_fbx
-from tests.core.motion.swings import CLIP, swinging_body
+from tests.core.motion.swings import CLIP, OTHER, swinging_body
 from tests.rigged_shapes import rigged_body, write_gltf
 from tests.skeletons import PERSON, character_from
 
@@ -117,6 +117,21 @@ def test_a_motion_of_the_first_body_is_checked_in_its_scene(
     with_joints = lcollision("check", "--clips", hero, "--body", hero, "--joints", "a.json", *scene)
     assert with_joints.exit_code == 2
     assert "isn't a rigged character, so --joints doesn't apply" in with_joints.stderr
+
+
+def test_a_clip_is_chosen_also_in_a_motion_file(
+    lcollision: Lcollision, hero: Path, tmp_path: Path
+) -> None:
+    swing = write_gltf(swinging_body(), tmp_path / "swing.glb")
+    other = tmp_path / "other.glb"
+    other.write_bytes(swing.read_bytes())
+    scene = ["--with", hero, "--at", "hero=9,0,0", "--json"]
+    for clip in (CLIP, OTHER):
+        done = lcollision("check", "--clips", other, "--body", swing, *scene, "--clip", clip)
+        (row,) = json.loads(done.stdout)
+        assert (row["clip"], bool(row["colliding_frames"])) == (f"{clip} + moves", clip == CLIP)
+    unknown = lcollision("check", "--clips", other, "--body", swing, *scene, "--clip", "wave")
+    assert "has no clip 'wave'; its clips are 'swing', 'nod', 'moves'" in unknown.stderr
 
 
 @pytest.mark.slow
