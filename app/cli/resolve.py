@@ -256,7 +256,8 @@ def resolve(
         return
     if model.is_trained:
         refuse_given(context, ("keep_feet",), "is for characters and motions", "leave it out")
-        compile_check_beside(model)
+        if options.verify:
+            compile_check_beside(model)
     elif of_motion.keep_feet:
         options = replace(options, standing=model.up)
     request = replace(request, fps=choice.fps or request.fps)

@@ -85,20 +85,32 @@ def test_a_wait_is_cancelled_and_the_process_ends_with_the_window(
     ahead.wait_for_all()
 
 
-@pytest.mark.parametrize("command", ["sample", "resolve"])
+@pytest.mark.parametrize(
+    ("command", "words", "is_checked"),
+    [("sample", "-n 1 --free", True), ("resolve", "{poses}", True)]
+    + [("resolve", "{poses} --no-verify", False)],
+)
 def test_a_command_waits_for_the_check_that_another_process_compiles(
-    lcollision: Lcollision, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+    lcollision: Lcollision,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+    words: str,
+    is_checked: bool,
 ) -> None:
     poses, ahead = tmp_path / "poses.json", CompileAhead()
     write_poses(poses, open_body("body"), [NamedPose("zero", np.zeros(110))])
     monkeypatch.setattr(compile_ahead, "AHEAD", ahead)
     # The process finds everything compiled.
     monkeypatch.setattr(compile_ahead, "is_compiled", lambda: False)
-    words = {"sample": ["-n", 1, "--free"], "resolve": [poses]}[command]
-    result = lcollision(command, "body", *words, "-o", tmp_path / "free.json")
+    given = [word.format(poses=poses) for word in words.split()]
+    result = lcollision(command, "body", *given, "-o", tmp_path / "free.json")
     assert (result.exit_code, "free.json" in result.stderr) == (0, True), result.stderr
-    assert ahead._process is not None
     assert ahead._checked.is_set()
+    if not is_checked:
+        assert ahead._process is None
+        return
+    assert ahead._process is not None
     ahead.wait_for_all()
     assert ahead._process.returncode == 0
 
