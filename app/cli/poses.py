@@ -147,7 +147,7 @@ def sample(
         note(f"{model.name}: {remark}")
     if error_bound and not model.has_predictor:
         note(f"{model.name} has no predictor, so --error-bound has no effect")
-    if model.is_trained and colliding is not None:
+    if model.is_trained and colliding is not None and not (error_bound and model.has_predictor):
         compile_check_beside(model)
     with progress_bar("Drawing poses") as job:
         latent = sample_poses(model, count, seed, colliding, job, clearance, error_bound)

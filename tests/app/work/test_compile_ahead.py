@@ -88,7 +88,8 @@ def test_a_wait_is_cancelled_and_the_process_ends_with_the_window(
 @pytest.mark.parametrize(
     ("command", "words", "is_checked"),
     [("sample", "-n 1 --free", True), ("resolve", "{poses}", True)]
-    + [("resolve", "{poses} --no-verify", False)],
+    + [("resolve", "{poses} --no-verify", False)]
+    + [("sample", "-n 1 --free --error-bound 0.5", False)],
 )
 def test_a_command_waits_for_the_check_that_another_process_compiles(
     lcollision: Lcollision,
