@@ -607,7 +607,7 @@ class WrittenMotions:
     Attributes
     ----------
     files : by the name of the body
-    stored : the motion, with the clips of characters as read back
+    stored : the motion, with changed clips as read back
     put_back : frames in which a clip was left unchanged, as its file can only store a worse result
     """
 
@@ -654,20 +654,20 @@ def write_member_motions(
             motion, first = played_motion.motion, played_motion.start
             if motion is None or not played_motion.is_own_clip:
                 name = before.name if motion is None else motion.name
-                write_new_clips(path, member.body, [Motion(name, after.times, new)])
+                written = write_new_clips(path, member.body, [Motion(name, after.times, new)])
             else:
                 motion = _lasting(motion, n - first, after.rate)
                 changed = replace(motion, codes=np.array(new[first:]))
                 spans = runs((motion.codes != changed.codes).any(axis=1))
                 change = MotionChange(motion, changed, spans)
                 written = write_clips(path, member.body, own_file, [change])
-                for sentence in written.notes:
-                    job.note(f"{member.name}: {sentence}")
                 (worse,) = written.put_back
                 put_back += [range(span.start + first, span.stop + first) for span in worse]
                 (stored,) = written.stored
                 places = body.space.codes[body.standing.index(member)]
                 codes[:, places] = stored.codes[replace(played_motion, motion=stored).frames(n)]
+            for sentence in written.notes:
+                job.note(f"{member.name}: {sentence}")
         files[member.name] = path
     return WrittenMotions(files, replace(after, codes=codes), put_back)
 

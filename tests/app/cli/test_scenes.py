@@ -350,10 +350,13 @@ def test_the_clip_of_an_fbx_is_reported_as_it_is_stored(
     names = tuple(f"bone {number}" for number in range(len(rigged.rig.joint_names)))
     rigged = replace(rigged, rig=replace(rigged.rig, joint_names=names))
     source, out = character_fbx(rigged, tmp_path / "other.fbx"), tmp_path / "out"
-    scene = ("--with", hero, "--at", "hero=90,0,0")
+    still = character_fbx(replace(rigged, clips={}), tmp_path / "still.fbx")
+    scene = ("--with", hero, "--at", "hero=90,0,0", "--with", still, "--at", "still=180,0,0")
     done = lcollision("resolve", source, *scene, "--motion", "-o", f"{out}/", "--json")
     assert done.exit_code == 0, done.output
-    assert sorted(path.name for path in out.iterdir()) == ["hero.glb", "other.glb"]
+    assert sorted(path.name for path in out.iterdir()) == ["hero.glb", "other.glb", "still.glb"]
+    for name in ("other", "still"):
+        assert f"{name}: FBX can't be written, so {name}.fbx comes back as GLB" in done.stderr
     (row,) = json.loads(done.stdout)
     assert row["free_after"] == row["frames"]
     assert row["kept_spans"] == []
