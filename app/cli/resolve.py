@@ -197,7 +197,6 @@ def resolve(
     either. Where joints turn, what a player shows between frames differs a little from that:
     --substeps of its poses are looked at as well.
     """
-    from app.work.compile_ahead import compile_check_beside
     from lcollision_core.bodies.partners import with_joint_map
     from lcollision_core.tasks.exporting import output_named
     from lcollision_core.tasks.inputs import holds_motion
@@ -256,8 +255,6 @@ def resolve(
         return
     if model.is_trained:
         refuse_given(context, ("keep_feet",), "is for characters and motions", "leave it out")
-        if options.verify:
-            compile_check_beside(model)
     elif of_motion.keep_feet:
         options = replace(options, standing=model.up)
     request = replace(request, fps=choice.fps or request.fps)
@@ -274,6 +271,7 @@ def _resolve_poses(
     as_json: bool,
 ) -> None:
     """Resolve the poses and meshes of files, print the results and exit with their status."""
+    from app.work.compile_ahead import begin_beside, wait_beside
     from lcollision_core.bodies import as_scene
     from lcollision_core.tasks.exporting import (
         files_of,
@@ -299,6 +297,9 @@ def _resolve_poses(
     files, failed = mesh_files_of(inputs), False
     if len(files) > 1 and scene is None:
         require_one_mesh(output, len(files))
+    compiles_ahead = body.is_trained and request.options.verify
+    if compiles_ahead:
+        begin_beside()
     with progress_bar("Reading poses") as job:
         if scene is not None:
             given = read_scene_poses(scene, files, scale, job)
@@ -309,6 +310,8 @@ def _resolve_poses(
     poses = [given_pose.pose for given_pose in given]
     read = [*files, *source_files(body, export)]
     refuse_to_replace(files_of(output, body, poses, export), read, in_place=in_place)
+    if compiles_ahead:
+        wait_beside(body)
     with cancellable_bar("Resolving poses") as job:
         resolved = resolve_poses(replace(request, given=given), job)
     for resolved_pose in resolved:

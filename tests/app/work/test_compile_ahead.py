@@ -116,6 +116,19 @@ def test_a_command_waits_for_the_check_that_another_process_compiles(
     assert ahead._process.returncode == 0
 
 
+def test_a_command_that_is_refused_does_not_wait(
+    lcollision: Lcollision, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wait(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(CompileAhead, "wait_for_check", wait)
+    monkeypatch.setattr(compile_ahead, "AHEAD", CompileAhead())
+    refused = lcollision("resolve", "body", tmp_path / "none.json", "-o", tmp_path / "free.json")
+    assert "none.json cannot be read: there is no such file" in refused.stderr
+    assert refused.exit_code == 2
+
+
 def test_what_an_older_version_or_another_python_compiled_does_not_count(kept: Path) -> None:
     folder = kept / "contact_1"
     folder.mkdir()
