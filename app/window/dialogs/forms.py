@@ -665,7 +665,8 @@ def _meanings(model: Body) -> dict[str, str]:
 
     looks = int(abs(model.front).argmax())
     sign = "-" if model.front[looks] < 0.0 else "+"
-    model_axes = f"{'xyz'[model.up_axis]} is up, front is {sign}{'xyz'[looks]}"
+    up = ("-" if min(model.up) < 0.0 else "") + "xyz"[model.up_axis]
+    model_axes = f"{up} is up, front is {sign}{'xyz'[looks]}"
     return {
         ExportAxes.MODEL: f"Same as the model: {model_axes}.",
         ExportAxes.Y_UP: "y is up, front is +z, in the model's unit.",

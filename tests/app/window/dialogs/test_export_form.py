@@ -14,7 +14,14 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.settings import SETTINGS
 from app.view.theme import DARK, LIGHT, apply_theme
-from app.window.dialogs.forms import EXPORT_NAMES, MESH, ExportDialog, Form, MotionDialog
+from app.window.dialogs.forms import (
+    EXPORT_NAMES,
+    MESH,
+    ExportDialog,
+    Form,
+    MotionDialog,
+    _meanings,
+)
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import ExportAxes, LearnedBody, NamedPose, RigBody, export_mesh
 from lcollision_core.files import read_character, read_mesh
@@ -23,6 +30,7 @@ from tests.app.support import export_pose
 from tests.app.windows import PATIENCE, accept_and_choose, answer, shown, take_picture
 from tests.core.character_file import figure
 from tests.core.gltf_builder import arm
+from tests.rigged_shapes import rigged_tube
 
 pytestmark = pytest.mark.one_window
 
@@ -404,3 +412,10 @@ def test_a_pose_is_printed_as_the_form_says(
     assert height == pytest.approx(50.0 + 2.0 - 0.5, abs=1e-4)
     assert window.settings["print_height"] == 50.0
     apply_theme(QApplication.instance(), LIGHT)
+
+
+@pytest.mark.parametrize(("sign", "axis"), [(1.0, "y"), (-1.0, "-y")])
+def test_the_model_s_own_axes_are_named_also_where_up_points_down(sign: float, axis: str) -> None:
+    character = rigged_tube()
+    model = RigBody.of(replace(character, up=sign * character.up))
+    assert _meanings(model)[ExportAxes.MODEL].startswith(f"Same as the model: {axis} is up, ")
