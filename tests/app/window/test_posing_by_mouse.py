@@ -255,7 +255,7 @@ class Puppeteer(Hand):
         if np.abs(end - start).max() < A_CLICK:
             return
         self.n_drags += 1
-        places = np.linspace(start, end, 15)
+        places = np.linspace(start, end, 30)
         QTest.mousePress(canvas, LEFT, key, _pixel(places[0]))
         for place in places[1:]:
             move_held(canvas, _pixel(place), key)
