@@ -134,7 +134,7 @@ def sample(
     With --with, they are poses of a scene; fixed bodies don't move, and the others only turn their
     joints.
     """
-    from app.work.compile_ahead import begin_beside, wait_beside
+    from app.work.compile_ahead import begin_compiling_check, wait_for_compiled_check
     from lcollision_core.bodies import NamedPose, sample_poses
     from lcollision_core.tasks.exporting import require_output, write_result
     from lcollision_core.tasks.scenes import open_scene
@@ -148,8 +148,8 @@ def sample(
     if error_bound and not model.has_predictor:
         note(f"{model.name} has no predictor, so --error-bound has no effect")
     if model.is_trained and colliding is not None and not (error_bound and model.has_predictor):
-        begin_beside()
-        wait_beside(model)
+        begin_compiling_check()
+        wait_for_compiled_check(model)
     with progress_bar("Drawing poses") as job:
         latent = sample_poses(model, count, seed, colliding, job, clearance, error_bound)
     width = len(str(count))

@@ -271,7 +271,7 @@ def _resolve_poses(
     as_json: bool,
 ) -> None:
     """Resolve the poses and meshes of files, print the results and exit with their status."""
-    from app.work.compile_ahead import begin_beside, wait_beside
+    from app.work.compile_ahead import begin_compiling_check, wait_for_compiled_check
     from lcollision_core.bodies import as_scene
     from lcollision_core.tasks.exporting import (
         files_of,
@@ -299,7 +299,7 @@ def _resolve_poses(
         require_one_mesh(output, len(files))
     compiles_ahead = body.is_trained and request.options.verify
     if compiles_ahead:
-        begin_beside()
+        begin_compiling_check()
     with progress_bar("Reading poses") as job:
         if scene is not None:
             given = read_scene_poses(scene, files, scale, job)
@@ -311,7 +311,7 @@ def _resolve_poses(
     read = [*files, *source_files(body, export)]
     refuse_to_replace(files_of(output, body, poses, export), read, in_place=in_place)
     if compiles_ahead:
-        wait_beside(body)
+        wait_for_compiled_check(body)
     with cancellable_bar("Resolving poses") as job:
         resolved = resolve_poses(replace(request, given=given), job)
     for resolved_pose in resolved:

@@ -119,13 +119,13 @@ def is_compiled() -> bool:
     return any(file.stat().st_mtime >= newest for place in places for file in place.glob(name))
 
 
-def begin_beside() -> None:
+def begin_compiling_check() -> None:
     """Begin to compile the exact check in another process, which ends with this one."""
     atexit.register(AHEAD.end)
     AHEAD.begin()
 
 
-def wait_beside(body: Body) -> None:
+def wait_for_compiled_check(body: Body) -> None:
     """Compile how a body is decoded, and wait until the other process has compiled the check."""
     body.decode(np.zeros(body.latent_size))
     AHEAD.wait_for_check()
